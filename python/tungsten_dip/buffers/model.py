@@ -1,0 +1,102 @@
+"""The data model: one image's worth of evidence, as numpy arrays.
+
+Arrays are float32, C-contiguous, shape (height, width, channels), row 0 at the top. Colour is linear radiance,
+normals are in world space with components in [-1, 1], depth is a distance along the ray (0 where it left the scene).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.errors import InputError
+
+FloatImage = npt.NDArray[np.float32]
+
+CHANNELS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
+"""Channel count of every quantity a renderer may write."""
+
+FEATURES = ("albedo", "normal", "depth", "visibility")
+"""The quantities that guide the fit, in the order in which a network sees them."""
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """One quantity of an image: its mean over all samples and, where known, what is known of its noise.
+
+    ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the variance of
+    ``mean`` (not of one sample). All have the shape of ``mean``.
+    """
+
+    mean: FloatImage
+    half_a: FloatImage | None = None
+    half_b: FloatImage | None = None
+    variance: FloatImage | None = None
+
+    @property
+    def has_halves(self) -> bool:
+        """Whether both halves are known."""
+        return self.half_a is not None and self.half_b is not None
+
+    def planes(self) -> Iterator[tuple[str, FloatImage]]:
+        """Yield (name, array) for every array that is known, in the order of the fields."""
+        for name in ("mean", "half_a", "half_b", "variance"):
+            array = getattr(self, name)
+            if array is not None:
+                yield name, array
+
+
+@dataclass(frozen=True)
+class RenderBuffers:
+    """Everything a renderer tells of one image.
+
+    ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies. ``alpha``
+    has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the output.
+
+    Raises InputError if the shapes or the channel counts do not fit together.
+    """
+
+    color: Buffer
+    albedo: Buffer | None = None
+    normal: Buffer | None = None
+    depth: Buffer | None = None
+    visibility: Buffer | None = None
+    spp: float | FloatImage | None = None
+    alpha: FloatImage | None = None
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        expected = self.color.mean.shape[:2]
+        for quantity, buffer in self.quantities():
+            for plane, array in buffer.planes():
+                shape = (*expected, CHANNELS[quantity])
+                if array.shape != shape or array.dtype != np.float32:
+                    raise InputError(
+                        f"{quantity} {plane}: expected float32 of shape {shape} (height, width, channels) as the "
+                        f"colour has it, got {array.dtype} of shape {array.shape}; render all buffers at one size"
+                    )
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.color.mean.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.color.mean.shape[1])
+
+    def quantities(self) -> Iterator[tuple[str, Buffer]]:
+        """Yield (name, buffer) for colour and every feature that is known."""
+        for name in CHANNELS:
+            buffer = getattr(self, name)
+            if buffer is not None:
+                yield name, buffer
+
+    def with_quantities(self, **buffers: Buffer | None) -> RenderBuffers:
+        """Return a copy with some quantities replaced."""
+        return replace(self, **buffers)  # type: ignore[arg-type]

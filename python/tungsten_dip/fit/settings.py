@@ -1,0 +1,72 @@
+"""What a fit is asked to do, and what it gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.errors import InputError
+
+Preset = Literal["draft", "balanced", "final", "paper"]
+Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of one fit. None means: as the preset has it.
+
+    ``network``, ``inputs``, ``scheme`` and ``channels`` describe the network of the published method and are used by
+    the preset ``paper`` alone. ``target_error`` is a relMSE (epsilon 0.01). ``threads`` None uses every core.
+
+    Raises InputError if a number is out of its range.
+    """
+
+    preset: Preset = "balanced"
+    iterations: int | None = None
+    time_budget_s: float | None = None
+    target_error: float | None = None
+    network: Literal["skip", "resnet"] = "skip"
+    inputs: Inputs = "all+random"
+    scheme: Literal["iic", "ioc"] = "iic"
+    channels: tuple[int, ...] = (8, 16, 32, 64, 128)
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "time_budget_s", "target_error", "threads"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"{name}: expected a number above 0, got {value}")
+        if not self.channels or any(count < 1 for count in self.channels):
+            raise InputError(f"channels: expected positive counts such as 8,16,32,64,128, got {self.channels}")
+
+
+@dataclass(frozen=True)
+class HistoryPoint:
+    """Where a fit stood: what it had cost and how good it knew itself to be."""
+
+    seconds: float
+    iteration: int
+    estimated_relmse: float | None
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A denoised image and what is known about it.
+
+    ``color`` is linear radiance, float32, shape (height, width, 3). ``error`` is the estimated squared error relative
+    to the squared radiance (relMSE, epsilon 0.01) of every pixel, shape (height, width, 1); its mean is
+    ``estimated_relmse``. Both are None where the buffers hold no independent evidence to estimate them from.
+    ``notes`` says in one line each what evidence was missing and what that meant.
+    """
+
+    color: FloatImage
+    settings: FitSettings
+    seconds: float
+    iterations: int
+    error: FloatImage | None = None
+    estimated_relmse: float | None = None
+    history: tuple[HistoryPoint, ...] = ()
+    notes: tuple[str, ...] = field(default=())

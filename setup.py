@@ -1,0 +1,31 @@
+"""Builds the C++ parts with CMake; all metadata is in pyproject.toml."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+
+class CMakeBuild(build_ext):
+    """Runs CMake once and lets it place the modules inside the package."""
+
+    def build_extension(self, ext: Extension) -> None:
+        """Configure and build the top-level CMakeLists.txt."""
+        root = Path(__file__).parent.resolve()
+        package_dir = Path(self.get_ext_fullpath(ext.name)).resolve().parent
+        build_dir = root / "build" / "pip"
+        subprocess.check_call(
+            [
+                "cmake", "-S", root, "-B", build_dir, "-G", "Ninja", "-DCMAKE_BUILD_TYPE=Release",
+                f"-DPython_EXECUTABLE={sys.executable}", f"-DTUNGSTEN_DIP_PACKAGE_DIR={package_dir}",
+                f"-DTUNGSTEN_DIP_VERSION={self.distribution.get_version()}",
+            ]
+        )  # fmt: skip
+        jobs = os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL", str(os.cpu_count() or 1))
+        subprocess.check_call(["cmake", "--build", build_dir, "--parallel", jobs])
+
+
+setup(ext_modules=[Extension("tungsten_dip._core", sources=[])], cmdclass={"build_ext": CMakeBuild})
