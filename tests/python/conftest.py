@@ -11,7 +11,7 @@ import pytest
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 
 SAMPLE_SHAPE = 0.5
-"""One sample is gamma distributed with this shape around the true radiance: its variance is radiance^2 / 0.5."""
+"""A sample is gamma distributed with this shape around the true radiance: its variance is radiance^2 / shape."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ MakeRender = Callable[..., SyntheticRender]
 
 @pytest.fixture
 def make_render() -> MakeRender:
-    """``make_render(height=40, width=56, spp=16, seed=0)``: a lit sphere over a checkered floor before a sky."""
+    """``make_render(height=40, width=56, spp=16, seed=0)``: a lit sphere on a checkered floor before a sky."""
     return _make_render
 
 
@@ -40,9 +40,8 @@ def render() -> SyntheticRender:
 def _make_render(height: int = 40, width: int = 56, spp: int = 16, seed: int = 0) -> SyntheticRender:
     rng = np.random.default_rng(seed)
     truth = _ground_truth(height, width)
-    color = truth["albedo"] * (
-        0.1 + np.clip(truth["normal"] @ np.array([0.4, 0.8, 0.45]), 0, None)[..., None]
-    )
+    cosine = truth["normal"] @ np.array([0.4, 0.8, 0.45])
+    color = truth["albedo"] * (0.1 + np.clip(cosine, 0, None)[..., None])
     color[truth["depth"][..., 0] == 0] = (0.3, 0.5, 1.5)
     buffers = {"color": _noisy(rng, color, spp)}
     for name, scale in (("albedo", 0.02), ("normal", 0.02), ("depth", 0.01)):

@@ -1,0 +1,1 @@
+"""The commands. Only code in here prints, reads the command line or ends the process."""

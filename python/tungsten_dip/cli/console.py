@@ -1,0 +1,172 @@
+"""How the commands talk: log lines and progress on stderr, one JSON object on stdout, exit statuses."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+from tqdm import tqdm
+
+from tungsten_dip.errors import InputError
+
+EXIT_INTERNAL, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+DEBUG_VARIABLE = "TUNGSTEN_DIP_DEBUG"
+"""Set in the environment, it lets tracebacks through."""
+
+EXTRA_BY_MODULE = {
+    "torch": "fit",
+    "mitsuba": "mitsuba",
+    "drjit": "mitsuba",
+    "flip_evaluator": "compare",
+    "skimage": "compare",
+}
+"""Which optional part of the package brings a module that is not installed."""
+
+SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+LINE_INTERVAL_S = 5.0
+"""How often progress is told where there is no terminal to draw a bar on."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line and whose options are never abbreviated."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise InputError in place of argparse's two lines."""
+        raise InputError(f"{message}; see '{self.prog} --help'")
+
+
+def run(command: str, body: Callable[[], None]) -> int:
+    """Run a command's body and return its exit status; whatever goes wrong becomes one line on stderr."""
+    _log_to_stderr(command)
+    debug = bool(os.environ.get(DEBUG_VARIABLE))
+    try:
+        body()
+    except KeyboardInterrupt:
+        return _fail(command, "interrupted", EXIT_INTERRUPTED)
+    except (InputError, OSError) as error:
+        if debug:
+            raise
+        return _fail(command, str(error), EXIT_INPUT)
+    except Exception as error:
+        if debug:
+            raise
+        if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
+            extra = EXTRA_BY_MODULE[error.name]
+            return _fail(
+                command, f"needs {error.name}; install it with pip install 'tungsten-dip[{extra}]'", EXIT_INPUT
+            )
+        line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
+        return _fail(command, line, EXIT_INTERNAL)
+    return 0
+
+
+@contextmanager
+def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Keep stdout for one JSON object: until the block ends, all else written there, by libraries too, goes to stderr.
+
+    Yields the function that prints the object. Numbers that JSON has no name for (NaN, Inf) become null.
+    """
+    if not enabled:
+        yield lambda _: None
+        return
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+
+    def emit(value: dict[str, Any]) -> None:
+        os.write(stdout, (json.dumps(_finite(value), indent=1) + "\n").encode())
+
+    try:
+        yield emit
+    finally:
+        sys.stdout.flush()
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+@contextmanager
+def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
+    """Yield a progress callback that shows a bar with the time left, or a line now and then off a terminal."""
+    if sys.stderr.isatty():
+        with tqdm(
+            total=1.0, desc=what, bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed} <{remaining}{postfix}"
+        ) as bar:
+
+            def draw(fraction: float, message: str) -> None:
+                bar.set_postfix_str(message, refresh=False)
+                bar.update(max(0.0, min(fraction, 1.0) - bar.n))
+
+            yield draw
+        return
+
+    start = last = time.monotonic()
+
+    def tell(fraction: float, message: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last < LINE_INTERVAL_S:
+            return
+        last = now
+        left = f", {tqdm.format_interval((now - start) * (1 / fraction - 1))} left" if fraction > 0 else ""
+        print(f"{what}: {fraction:.0%}{left}{', ' + message if message else ''}", file=sys.stderr, flush=True)
+
+    yield tell
+    print(f"{what}: done in {tqdm.format_interval(time.monotonic() - start)}", file=sys.stderr, flush=True)
+
+
+def duration(text: str, default_unit: str = "s") -> float:
+    """Return the seconds of ``90s``, ``5m``, ``1.5h`` or ``1h30m``; a bare number has the default unit.
+
+    Raises InputError if the text is none of these.
+    """
+    parts = re.findall(r"\s*(\d+\.?\d*|\.\d+)\s*(ms|s|m|h|d)?", text)
+    if not parts or not re.fullmatch(r"(\s*(\d+\.?\d*|\.\d+)\s*(ms|s|m|h|d)?)+\s*", text):
+        raise InputError(f"expected a duration such as 90s, 5m or 1.5h, got '{text}'")
+    return math.fsum(float(number) * SECONDS_BY_UNIT[unit or default_unit] for number, unit in parts)
+
+
+class _StderrHandler(logging.Handler):
+    """Writes log lines above a progress bar, if one is being drawn."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        tqdm.write(self.format(record), file=sys.stderr)
+
+
+def _log_to_stderr(command: str) -> None:
+    logger = logging.getLogger("tungsten_dip")
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    for handler in list(logger.handlers):
+        logger.removeHandler(handler)
+    handler = _StderrHandler()
+    handler.setFormatter(logging.Formatter(f"{command}: %(message)s"))
+    logger.addHandler(handler)
+
+
+def _fail(command: str, message: str, status: int) -> int:
+    print(f"{command}: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    return status
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

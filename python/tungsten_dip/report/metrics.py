@@ -1,0 +1,112 @@
+"""How far an image is from its reference, in the field's usual numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.errors import InputError
+
+RELMSE_EPSILON = 0.01
+"""Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""
+
+DISPLAY_GAMMA = 2.2
+
+SSIM_WINDOW = 7
+"""Side in pixels of the window in which Wang et al. 2004 compare, as scikit-image has it."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Distances of an image from its reference.
+
+    ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2); ``relmse`` and
+    ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None where a side is under
+    7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of exposures. ``nonfinite``
+    counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is the mean radiance over the
+    reference's, None where that is black.
+    """
+
+    psnr: float
+    relmse: float
+    ssim: float | None
+    flip: float
+    hdrflip: float | None
+    nonfinite: int
+    mean_ratio: float | None
+
+
+def compare(image: FloatImage, reference: FloatImage) -> Comparison:
+    """Compare two images of linear radiance, shape (height, width, 3).
+
+    PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is Wang et al.
+    2004; FLIP is Andersson et al. 2020 and HDR-FLIP Andersson et al. 2021, both at 67 pixels per degree.
+
+    Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference is not
+    finite.
+    """
+    if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(
+            f"compare: expected two images of one shape (height, width, 3), got {image.shape} and {reference.shape}; "
+            "bring them to one size"
+        )
+    if image.size == 0:
+        raise InputError(f"compare: expected an image with pixels, got one of shape {image.shape}")
+    if not np.isfinite(reference).all():
+        raise InputError("compare: expected a finite reference, got one with NaN or Inf; render it anew")
+
+    finite = np.isfinite(image)
+    x = np.where(finite, image, 0).astype(np.float32)
+    r = reference.astype(np.float32)
+    displayed_x, displayed_r = display_from_linear(x), display_from_linear(r)
+    reference_mean = float(r.mean(dtype=np.float64))
+    return Comparison(
+        psnr=_psnr(displayed_x, displayed_r),
+        relmse=float(relative_squared_error(x, r).mean()),
+        ssim=_ssim(displayed_x, displayed_r),
+        flip=_flip(displayed_x, displayed_r, "LDR"),
+        hdrflip=_hdrflip(x, r),
+        nonfinite=int(finite.size - np.count_nonzero(finite)),
+        mean_ratio=float(x.mean(dtype=np.float64)) / reference_mean if reference_mean > 0 else None,
+    )
+
+
+def relative_squared_error(image: FloatImage, reference: FloatImage) -> npt.NDArray[np.float64]:
+    """Return (x - r)^2 / (r^2 + 0.01) of every value, in the shape of the images; its mean is relMSE."""
+    x, r = image.astype(np.float64), reference.astype(np.float64)
+    return (x - r) ** 2 / (r**2 + RELMSE_EPSILON)
+
+
+def display_from_linear(image: FloatImage) -> FloatImage:
+    """Return linear radiance as displayed for the metrics: clipped to [0, 1], gamma 2.2."""
+    return np.clip(image, 0, 1, dtype=np.float32) ** np.float32(1 / DISPLAY_GAMMA)
+
+
+def _psnr(x: FloatImage, r: FloatImage) -> float:
+    mse = float(np.mean((x.astype(np.float64) - r) ** 2))
+    return float("inf") if mse == 0 else float(-10 * np.log10(mse))
+
+
+def _ssim(x: FloatImage, r: FloatImage) -> float | None:
+    if min(x.shape[:2]) < SSIM_WINDOW:
+        return None
+    from skimage.metrics import structural_similarity
+
+    return float(structural_similarity(x, r, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=2))
+
+
+def _hdrflip(x: FloatImage, r: FloatImage) -> float | None:
+    luminance = r @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    # FLIP takes its exposures from the maximum down to the median and ends the process where these are equal.
+    if luminance.max() <= max(float(np.median(luminance)), 0) * (1 + 1e-4):
+        return None
+    return _flip(x, r, "HDR")
+
+
+def _flip(x: FloatImage, r: FloatImage, dynamic_range: str) -> float:
+    import flip_evaluator
+
+    return float(flip_evaluator.evaluate(r, x, dynamic_range, applyMagma=False)[1])
