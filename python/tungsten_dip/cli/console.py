@@ -67,7 +67,9 @@ def run(command: str, body: Callable[[], None]) -> int:
         if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
             extra = EXTRA_BY_MODULE[error.name]
             return _fail(
-                command, f"needs {error.name}; install it with pip install 'tungsten-dip[{extra}]'", EXIT_INPUT
+                command,
+                f"needs {error.name}; install it with pip install 'tungsten-dip[{extra}]'",
+                EXIT_INPUT,
             )
         line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
         return _fail(command, line, EXIT_INTERNAL)
@@ -103,7 +105,9 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
     """Yield a progress callback that shows a bar with the time left, or a line now and then off a terminal."""
     if sys.stderr.isatty():
         with tqdm(
-            total=1.0, desc=what, bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed} <{remaining}{postfix}"
+            total=1.0,
+            desc=what,
+            bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed} <{remaining}{postfix}",
         ) as bar:
 
             def draw(fraction: float, message: str) -> None:

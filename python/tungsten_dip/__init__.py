@@ -1,0 +1,66 @@
+"""Denoise path-traced images with a deep image prior guided by feature buffers; no training data needed.
+
+The public names are all here and load on first use, so that importing the package loads neither torch nor a renderer:
+
+    import tungsten_dip as dip
+
+    buffers = dip.read_buffers("renders/kitchen")
+    result = dip.denoise(buffers, dip.FitSettings(preset="draft"))
+    dip.write_denoised("kitchen_denoised.exr", result, buffers)
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, write_denoised
+    from tungsten_dip.errors import InputError
+    from tungsten_dip.fit import FitResult, FitSettings, denoise
+    from tungsten_dip.hosts import render
+    from tungsten_dip.report import Comparison, compare
+    from tungsten_dip.scene import load_scene
+
+    __version__: str
+
+_MODULE_BY_NAME = {
+    "Buffer": "buffers",
+    "Comparison": "report",
+    "FitResult": "fit",
+    "FitSettings": "fit",
+    "InputError": "errors",
+    "RenderBuffers": "buffers",
+    "compare": "report",
+    "denoise": "fit",
+    "load_scene": "scene",
+    "read_buffers": "buffers",
+    "render": "hosts",
+    "write_denoised": "buffers",
+}
+
+__all__ = [
+    "Buffer",
+    "Comparison",
+    "FitResult",
+    "FitSettings",
+    "InputError",
+    "RenderBuffers",
+    "__version__",
+    "compare",
+    "denoise",
+    "load_scene",
+    "read_buffers",
+    "render",
+    "write_denoised",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("tungsten-dip")
+    if name not in _MODULE_BY_NAME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_BY_NAME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
