@@ -1,6 +1,6 @@
 """Denoise path-traced images with a deep image prior guided by feature buffers; no training data needed.
 
-The public names are all here and load on first use, so that importing the package loads neither torch nor a renderer:
+The public names are all here and load on first use: importing the package loads neither torch nor a renderer.
 
     import tungsten_dip as dip
 

@@ -78,7 +78,7 @@ def run(command: str, body: Callable[[], None]) -> int:
 
 @contextmanager
 def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Keep stdout for one JSON object: until the block ends, all else written there, by libraries too, goes to stderr.
+    """Keep stdout for one JSON object: within the block all else written there, by libraries too, goes to stderr.
 
     Yields the function that prints the object. Numbers that JSON has no name for (NaN, Inf) become null.
     """
@@ -102,7 +102,7 @@ def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
-    """Yield a progress callback that shows a bar with the time left, or a line now and then off a terminal."""
+    """Yield a progress callback: a bar with the time left, or a line now and then where there is no terminal."""
     if sys.stderr.isatty():
         with tqdm(
             total=1.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,11 +24,11 @@ SSIM_WINDOW = 7
 class Comparison:
     """Distances of an image from its reference.
 
-    ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2); ``relmse`` and
-    ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None where a side is under
-    7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of exposures. ``nonfinite``
-    counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is the mean radiance over the
-    reference's, None where that is black.
+    ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2); ``relmse``
+    and ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None where a side is
+    under 7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of exposures.
+    ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is the mean
+    radiance over the reference's, None where that is black.
     """
 
     psnr: float
@@ -42,16 +43,16 @@ class Comparison:
 def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     """Compare two images of linear radiance, shape (height, width, 3).
 
-    PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is Wang et al.
-    2004; FLIP is Andersson et al. 2020 and HDR-FLIP Andersson et al. 2021, both at 67 pixels per degree.
+    PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is Wang et
+    al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP Andersson et al. 2021, both at 67 pixels per degree.
 
-    Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference is not
-    finite.
+    Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference
+    is not finite.
     """
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(
-            f"compare: expected two images of one shape (height, width, 3), got {image.shape} and {reference.shape}; "
-            "bring them to one size"
+            f"compare: expected two images of one shape (height, width, 3), got {image.shape} and "
+            f"{reference.shape}; bring them to one size"
         )
     if image.size == 0:
         raise InputError(f"compare: expected an image with pixels, got one of shape {image.shape}")
@@ -82,7 +83,8 @@ def relative_squared_error(image: FloatImage, reference: FloatImage) -> npt.NDAr
 
 def display_from_linear(image: FloatImage) -> FloatImage:
     """Return linear radiance as displayed for the metrics: clipped to [0, 1], gamma 2.2."""
-    return np.clip(image, 0, 1, dtype=np.float32) ** np.float32(1 / DISPLAY_GAMMA)
+    clipped: FloatImage = np.clip(image, 0, 1, dtype=np.float32) ** np.float32(1 / DISPLAY_GAMMA)
+    return clipped
 
 
 def _psnr(x: FloatImage, r: FloatImage) -> float:
@@ -93,9 +95,10 @@ def _psnr(x: FloatImage, r: FloatImage) -> float:
 def _ssim(x: FloatImage, r: FloatImage) -> float | None:
     if min(x.shape[:2]) < SSIM_WINDOW:
         return None
-    from skimage.metrics import structural_similarity
+    from skimage import metrics
 
-    return float(structural_similarity(x, r, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=2))
+    similarity: Callable[..., float] = metrics.structural_similarity
+    return float(similarity(x, r, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=2))
 
 
 def _hdrflip(x: FloatImage, r: FloatImage) -> float | None:
