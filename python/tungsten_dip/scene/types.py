@@ -90,9 +90,9 @@ class ConstantTexture(Texture):
 class BitmapTexture(Texture):
     """An image file. A bare string in the file becomes this too.
 
-    ``gamma_correct`` undoes an sRGB-like gamma of 2.2 in 8-bit images and leaves HDR images alone.
-    ``interpolate`` is bilinear filtering, ``clamp`` stops at the border where the default repeats, ``scale``
-    multiplies the values.
+    ``gamma_correct`` undoes a gamma of 2.2 in 8-bit colour; HDR images, and images that give a number
+    (roughness, bump, alpha), are taken as they are. ``interpolate`` is bilinear filtering, ``clamp`` stops at
+    the border where the default repeats, ``scale`` multiplies the values.
     """
 
     kind: ClassVar[str] = "bitmap"
@@ -720,7 +720,8 @@ class Instances(Primitive):
     """Copies of ``masters``: ``instances`` lists them, or a binary file does.
 
     With a second file ``file_b`` every placement is interpolated by ``ratio``. A master is placed by its own
-    transform first, then by the placement; the transform of the instances themselves is not applied.
+    transform, then by its placement, then by the transform here, whose scale moves the copies apart but
+    leaves their size alone.
     """
 
     kind: ClassVar[str] = "instances"
@@ -807,7 +808,8 @@ class CubemapCamera(Camera):
 class Integrator:
     """How light is followed.
 
-    A path has at most ``max_bounces`` edges after the first; 1 is direct light alone.
+    A path has at most ``max_bounces`` edges: with 1 only emitters in plain view are seen, with 2 direct light
+    too. Surfaces that light crosses unbent (``forward``, ``transparency``) count.
     """
 
     kind: ClassVar[str] = ""
