@@ -1,0 +1,83 @@
+# Everything that a clone needs; `make` lists it. What is installed goes into .venv, what is built into build.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+
+# The first Python that is new enough; `make PYTHON=python3.13 ...` chooses another.
+PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 python3.11,$(shell \
+	$(name) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(name))))
+ifeq ($(origin CXX),default)
+CXX := c++
+endif
+
+CXX_FOLDERS := $(wildcard cpp mitsuba_ext tungsten_ext tests/cpp)
+CXX_SOURCES := $(shell find $(CXX_FOLDERS) -name '*.[ch]pp')
+BUILD_FILES := pyproject.toml setup.py $(shell find CMakeLists.txt $(CXX_FOLDERS) -name CMakeLists.txt)
+
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+.PHONY: help demo test lint format clean
+
+help: ## list what can be made
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1 \2/p' Makefile | while read -r goal does; do \
+		printf '  make %-8s %s\n' "$$goal" "$$does"; done
+
+demo: $(VENV)/installed ## render examples/cornell-box with little light, denoise it into demo/
+	@mkdir -p demo
+	$(BIN)/tungsten --dip-denoise --spp 8 --output-directory demo --dip-report demo/report.html \
+		examples/cornell-box/scene.json
+
+test: build/dev/build.ninja ## run every test, C++ and Python
+	$(BIN)/cmake --build build/dev
+	$(BIN)/ctest --test-dir build/dev --output-on-failure
+	$(BIN)/python -m pytest
+
+lint: build/dev/build.ninja ## check style and types of all code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run --Werror $(CXX_SOURCES)
+	$(BIN)/python $(BIN)/run-clang-tidy.py -quiet -clang-tidy-binary $(BIN)/clang-tidy -p build/dev
+
+format: $(VENV)/developing ## bring all code into shape
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CXX_SOURCES)
+
+clean: ## remove everything that was installed or built
+	rm -rf $(VENV) build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find python tests -name __pycache__ -prune -exec rm -rf {} +
+	find python -name '*.so' -delete -o -name '*.egg-info' -prune -exec rm -rf {} +
+
+# $(call missing,what,Debian's packages,Fedora's packages,the command on macOS): say so and stop.
+missing = { printf '%s\n' 'This needs $(1). It comes with:' '  Debian, Ubuntu   apt install $(2)' \
+	'  Fedora           dnf install $(3)' '  macOS            $(4)' >&2; exit 1; }
+
+$(VENV)/created:
+	@test -n "$(PYTHON)" \
+		|| $(call missing,Python 3.11 or newer,python3 python3-venv python3-dev,python3 python3-devel,brew install python)
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
+		|| $(call missing,the Python module venv,python3-venv,python3,brew install python)
+	@$(PYTHON) -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null \
+		|| $(call missing,the header files of Python,python3-dev,python3-devel,brew install python)
+	@printf '#include <concepts>\n#include <span>\nint main() {}\n' | $(CXX) -std=c++20 -x c++ -fsyntax-only - \
+		|| $(call missing,a compiler for C++20 (GCC 11 or Clang 14),g++,gcc-c++,xcode-select --install)
+	@echo "Creating $(VENV) with $$($(PYTHON) --version)"
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+# Built against the packages in .venv (the plugin needs the very Mitsuba that loads it), hence without isolation.
+$(VENV)/installed: $(VENV)/created constraints.txt $(BUILD_FILES) $(CXX_SOURCES)
+	@echo "Installing what it needs and building the C++ parts: some minutes the first time"
+	$(PIP) cmake mitsuba ninja pybind11 setuptools
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[all]'
+	@touch $@
+
+$(VENV)/developing: $(VENV)/installed
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+build/dev/build.ninja: $(VENV)/developing CMakePresets.json
+	PATH="$(CURDIR)/$(BIN):$$PATH" cmake --preset dev -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python"
+	@touch $@
