@@ -1,0 +1,55 @@
+// tungsten_diffuse_transmission: scatters diffusely to both sides.
+//
+//   albedo          texture
+//   transmittance   float in [0, 1]: the share that goes through
+#include "tungsten_bsdf.hpp"
+
+namespace mitsuba {
+
+template <typename Float, typename Spectrum>
+class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
+  public:
+    using Base = TungstenBsdf<Float, Spectrum>;
+    MI_IMPORT_TYPES(Texture)
+
+    explicit DiffuseTransmission(const Properties& props) : Base(props) {
+        m_albedo = props.get_texture<Texture>("albedo", 1.f);
+        m_transmittance = props.get<float>("transmittance", 0.5f);
+        Base::add_component(BSDFFlags::DiffuseReflection, BSDFFlags::FrontSide | BSDFFlags::BackSide);
+        Base::add_component(BSDFFlags::DiffuseTransmission, BSDFFlags::FrontSide | BSDFFlags::BackSide);
+    }
+
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+                                             Float sample1, const Point2f& sample2,
+                                             Mask active) const override {
+        if (!active) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
+        const bool transmit = sample1 < m_transmittance;
+        Vector3f wo = warp::square_to_cosine_hemisphere(sample2);
+        if (transmit == (si.wi.z() > 0.f)) wo.z() = -wo.z();
+        return Base::weighted(
+            transmit ? Base::sample_of(wo, BSDFFlags::DiffuseTransmission, 1)
+                     : Base::sample_of(wo, BSDFFlags::DiffuseReflection, 0),
+            si);
+    }
+
+    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
+        return m_albedo->eval(si, active);
+    }
+
+    MI_DECLARE_CLASS(DiffuseTransmission)
+
+  protected:
+    std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
+        const Float share = si.wi.z() * wo.z() < 0.f ? m_transmittance : 1.f - m_transmittance;
+        const Float density = share * kInvPi * std::abs(wo.z());
+        return {m_albedo->eval(si) * density, density};
+    }
+
+  private:
+    ref<Texture> m_albedo;
+    float m_transmittance;
+};
+
+}  // namespace mitsuba
+
+TUNGSTEN_EXPORT_PLUGIN(DiffuseTransmission)

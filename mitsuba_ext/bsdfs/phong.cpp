@@ -1,0 +1,68 @@
+// tungsten_phong: a lobe cos^exponent about the mirror direction, and a diffuse one.
+//
+//   albedo          texture; colours both lobes
+//   exponent        float
+//   diffuse_ratio   float in [0, 1]: the weight of the diffuse lobe
+#include <mitsuba/core/frame.h>
+
+#include "tungsten_bsdf.hpp"
+
+namespace mitsuba {
+
+template <typename Float, typename Spectrum>
+class Phong final : public TungstenBsdf<Float, Spectrum> {
+  public:
+    using Base = TungstenBsdf<Float, Spectrum>;
+    MI_IMPORT_TYPES(Texture)
+
+    explicit Phong(const Properties& props) : Base(props) {
+        m_albedo = props.get_texture<Texture>("albedo", 1.f);
+        m_exponent = props.get<float>("exponent", 64.f);
+        m_diffuse_ratio = props.get<float>("diffuse_ratio", 0.2f);
+        Base::add_component(BSDFFlags::GlossyReflection);
+        Base::add_component(BSDFFlags::DiffuseReflection);
+    }
+
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+                                             Float sample1, const Point2f& sample2,
+                                             Mask active) const override {
+        if (!active || si.wi.z() <= 0.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
+        if (sample1 < m_diffuse_ratio)
+            return Base::weighted(
+                Base::sample_of(warp::square_to_cosine_hemisphere(sample2), BSDFFlags::DiffuseReflection, 1),
+                si);
+        const Float cos_theta = std::pow(sample2.y(), 1.f / (1.f + m_exponent));
+        const Float sin_theta = std::sqrt(std::max(1.f - squared(cos_theta), 0.f));
+        const Float phi = kTwoPi * sample2.x();
+        const Frame3f lobe(Vector3f(-si.wi.x(), -si.wi.y(), si.wi.z()));
+        const Vector3f wo =
+            lobe.to_world(Vector3f(std::cos(phi) * sin_theta, std::sin(phi) * sin_theta, cos_theta));
+        return Base::weighted(Base::sample_of(wo, BSDFFlags::GlossyReflection, 0), si);
+    }
+
+    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
+        return m_albedo->eval(si, active);
+    }
+
+    MI_DECLARE_CLASS(Phong)
+
+  protected:
+    std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
+        if (si.wi.z() <= 0.f || wo.z() <= 0.f) return {Spectrum(0.f), 0.f};
+        const Float cos_lobe = si.wi.z() * wo.z() - si.wi.x() * wo.x() - si.wi.y() * wo.y();
+        const Float power = cos_lobe > 0.f ? std::pow(cos_lobe, m_exponent) * (1.f - m_diffuse_ratio) : 0.f;
+        const Float diffuse = m_diffuse_ratio * kInvPi;
+        const Float value = diffuse + power * (m_exponent + 2.f) / kTwoPi;
+        return {m_albedo->eval(si) * (value * wo.z()),
+                diffuse * wo.z() + power * (m_exponent + 1.f) / kTwoPi};
+    }
+
+  private:
+    ref<Texture> m_albedo;
+    float m_exponent;
+    float m_diffuse_ratio;
+};
+
+}  // namespace mitsuba
+
+TUNGSTEN_EXPORT_PLUGIN(Phong)
