@@ -1,0 +1,133 @@
+// The hook's Python face: arrays share memory with Tungsten's buffers, and the GIL is released while it
+// renders.
+#include "bindings.hpp"
+
+#include <pybind11/numpy.h>
+#include <pybind11/stl.h>
+
+#include "render.hpp"
+
+namespace py = pybind11;
+
+namespace tungsten_dip {
+
+namespace {
+
+using FloatArray = py::array_t<float, py::array::c_style>;
+
+// An array over memory that lives as long as any array of the same evidence.
+py::object array_over(const Evidence& evidence, float* data, int channels) {
+    if (!data) return py::none();
+    py::capsule owner(new std::shared_ptr<void>(evidence.memory),
+                      [](void* shared) { delete static_cast<std::shared_ptr<void>*>(shared); });
+    return FloatArray({evidence.height, evidence.width, channels}, data, owner);
+}
+
+py::dict dict_from_evidence(const Evidence& evidence) {
+    py::dict result;
+    for (const Quantity& quantity : evidence.quantities) {
+        py::dict planes;
+        planes["mean"] = array_over(evidence, quantity.mean, quantity.channels);
+        planes["half_a"] = array_over(evidence, quantity.half_a, quantity.channels);
+        planes["half_b"] = array_over(evidence, quantity.half_b, quantity.channels);
+        planes["variance"] = array_over(evidence, quantity.variance, quantity.channels);
+        result[quantity.name] = planes;
+    }
+    result["spp"] = evidence.spp ? array_over(evidence, evidence.spp, 1) : py::float_(evidence.uniform_spp);
+    return result;
+}
+
+// Passes are rendered whole: a pass cut short would leave a state that cannot be resumed. What a signal
+// handler raises in the meantime is raised after the pass.
+void render_pass(Render& render) {
+    using namespace std::chrono_literals;
+    constexpr auto signal_poll = 50ms;
+    std::optional<py::error_already_set> raised;
+    {
+        py::gil_scoped_release release;
+        render.start_pass();
+    }
+    for (bool finished = false; !finished;) {
+        {
+            py::gil_scoped_release release;
+            finished = render.wait_for_pass(signal_poll);
+        }
+        if (PyErr_CheckSignals() != 0) raised.emplace();
+    }
+    if (raised) throw std::move(*raised);
+}
+
+}  // namespace
+
+void bind(py::module_& module) {
+    module.doc() = "Tungsten itself: renders a scene and hands over its camera's buffers.";
+    module.attr("tungsten_version") = tungsten_version();
+
+    py::class_<RenderPlan>(module, "RenderPlan", "What the scene file and the overrides come to.")
+        .def_readonly("integrator", &RenderPlan::integrator)
+        .def_readonly("tonemap", &RenderPlan::tonemap)
+        .def_readonly("output_file", &RenderPlan::output_file)
+        .def_readonly("hdr_output_file", &RenderPlan::hdr_output_file)
+        .def_readonly("checkpoint_interval_s", &RenderPlan::checkpoint_interval_s)
+        .def_readonly("timeout_s", &RenderPlan::timeout_s)
+        .def_readonly("resume", &RenderPlan::resume)
+        .def_readonly("writes_features", &RenderPlan::writes_features)
+        .def_readonly("seed", &RenderPlan::seed);
+
+    py::class_<Render>(module, "Render",
+                       "A loaded scene that is rendered pass by pass; one at a time per process.")
+        .def(py::init([](const std::string& scene, int threads, std::optional<std::uint32_t> spp,
+                         std::optional<std::uint32_t> seed, std::string input_directory,
+                         std::string output_directory, std::string output_file, std::string hdr_output_file) {
+                 return std::make_unique<Render>(
+                     scene, RenderOptions{threads, spp, seed, std::move(input_directory),
+                                          std::move(output_directory), std::move(output_file),
+                                          std::move(hdr_output_file)});
+             }),
+             py::arg("scene"), py::kw_only(), py::arg("threads") = 0, py::arg("spp") = py::none(),
+             py::arg("seed") = py::none(), py::arg("input_directory") = "", py::arg("output_directory") = "",
+             py::arg("output_file") = "", py::arg("hdr_output_file") = "",
+             py::call_guard<py::gil_scoped_release>(),
+             "Load a scene. Raises RuntimeError, in one line, where Tungsten cannot.")
+        .def_property_readonly("plan", &Render::plan, py::return_value_policy::copy)
+        .def_property_readonly("current_spp", &Render::current_spp)
+        .def_property_readonly("total_spp", &Render::total_spp)
+        .def_property_readonly("done", &Render::done)
+        .def("resume", &Render::resume, "Continue from the saved state; False where there is none that fits.")
+        .def("render_pass", &render_pass, "Render the next samples (the scene's spp_step) of every pixel.")
+        .def("save_checkpoint", &Render::save_checkpoint, py::call_guard<py::gil_scoped_release>())
+        .def("save_outputs", &Render::save_outputs, py::call_guard<py::gil_scoped_release>())
+        .def(
+            "evidence",
+            [](const Render& render) {
+                const auto evidence = [&] {
+                    py::gil_scoped_release release;
+                    return render.evidence();
+                }();
+                return dict_from_evidence(evidence);
+            },
+            "A copy of what is known so far: {quantity: {mean, half_a, half_b, variance}, 'spp': ...}.")
+        .def(
+            "take_evidence",
+            [](Render& render) {
+                const auto evidence = [&] {
+                    py::gil_scoped_release release;
+                    return render.take_evidence();
+                }();
+                return dict_from_evidence(evidence);
+            },
+            "Tungsten's own buffers as arrays, without a copy, as evidence() has them; ends the render.");
+
+    module.def(
+        "save_ldr",
+        [](const std::string& path, const FloatArray& radiance, const std::string& tonemap) {
+            if (radiance.ndim() != 3 || radiance.shape(2) != 3)
+                throw py::value_error("radiance: expected float32 of shape (height, width, 3)");
+            save_ldr(path, {radiance.data(), static_cast<std::size_t>(radiance.size())},
+                     static_cast<int>(radiance.shape(1)), static_cast<int>(radiance.shape(0)), tonemap);
+        },
+        py::arg("path"), py::arg("radiance").noconvert(), py::arg("tonemap"),
+        "Write linear radiance, tonemapped as Tungsten does it, as PNG or JPEG.");
+}
+
+}  // namespace tungsten_dip

@@ -1,0 +1,111 @@
+// One scene rendered by Tungsten, and the evidence in its camera's output buffers. Knows neither Python nor,
+// in this header, Tungsten: only render.cpp and stock.cpp see its headers, compiled as Tungsten itself was.
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <memory>
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+namespace tungsten_dip {
+
+// What the stock command's flags override in the scene file; what is unset or empty stays as the scene has
+// it.
+struct RenderOptions {
+    int threads = 0;  // 0: number of cores minus one, as the stock command
+    std::optional<std::uint32_t> spp;
+    std::optional<std::uint32_t> seed;
+    std::string input_directory;
+    std::string output_directory;
+    std::string output_file;
+    std::string hdr_output_file;
+};
+
+// One quantity of the image, row 0 at the top, `channels` floats per pixel. `variance` is that of the mean.
+// The halves and the variance are null where the integrator mixes samples in a way that keeps no independent
+// halves.
+struct Quantity {
+    const char* name;
+    int channels;
+    float* mean;
+    float* half_a;
+    float* half_b;
+    float* variance;
+};
+
+// What one render knows. `memory` owns every array; `spp` is null where every pixel has `uniform_spp`
+// samples.
+struct Evidence {
+    int width;
+    int height;
+    std::vector<Quantity> quantities;
+    float* spp;
+    float uniform_spp;
+    std::shared_ptr<void> memory;
+};
+
+// What a driver needs to know of the scene file, after the overrides. File names are absolute; empty: not
+// asked for.
+struct RenderPlan {
+    std::string integrator;
+    std::string tonemap;
+    std::string output_file;
+    std::string hdr_output_file;
+    double checkpoint_interval_s;
+    double timeout_s;
+    bool resume;           // the scene asks for it and the integrator can do it
+    bool writes_features;  // the integrator fills albedo, normal, depth and visibility
+    std::uint32_t seed;
+};
+
+// A loaded scene that asks for the evidence a fit needs: independent sampler, halves and variance of every
+// quantity the integrator writes. The scene's own buffer files are still written as the scene asks. One at a
+// time per process. Every method throws std::runtime_error (or what Tungsten throws) with a message in words.
+class Render {
+  public:
+    Render(const std::string& scene, const RenderOptions& options);
+    ~Render();
+    Render(const Render&) = delete;
+    Render& operator=(const Render&) = delete;
+
+    const RenderPlan& plan() const;
+    std::uint32_t current_spp() const;
+    std::uint32_t total_spp() const;
+    bool done() const;
+
+    // Continues from the saved state of an earlier render with evidence; false where there is none that fits.
+    bool resume();
+
+    // Renders one pass (`spp_step` samples per pixel): start it, then wait until wait_for_pass returns true.
+    void start_pass();
+    bool wait_for_pass(std::chrono::milliseconds at_most);
+
+    void save_checkpoint();
+    void save_outputs();
+
+    // A copy of what is known so far; the render may go on.
+    Evidence evidence() const;
+    // The buffers themselves, without a copy (only the means are computed). The scene is freed; the render is
+    // over.
+    Evidence take_evidence();
+
+  private:
+    struct Impl;
+    std::unique_ptr<Impl> impl_;
+};
+
+// Writes linear radiance (3 floats per pixel) as Tungsten writes its low dynamic range image: tonemapped, PNG
+// or JPEG.
+void save_ldr(const std::string& path, std::span<const float> radiance, int width, int height,
+              const std::string& tonemap);
+
+// The version of the Tungsten that was found.
+const char* tungsten_version();
+
+// The stock command, compiled from the found checkout. Returns 1 where a scene could not be rendered, else 0.
+int run_stock(int argc, const char* argv[]);
+
+}  // namespace tungsten_dip
