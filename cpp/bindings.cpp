@@ -1,4 +1,177 @@
-// The Python module _core: the only file that knows pybind11.
+// The Python module _core: the one file that knows pybind11. Arrays are shared with numpy, never converted.
+#include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <algorithm>
+#include <array>
+#include <limits>
+#include <map>
+#include <optional>
+#include <string>
+#include <utility>
+
 #include "core.hpp"
-PYBIND11_MODULE(_core, module) { module.attr("__version__") = TUNGSTEN_DIP_VERSION; }
+
+namespace py = pybind11;
+
+namespace tungsten_dip {
+namespace {
+
+using Array = py::array_t<float, py::array::c_style>;
+
+std::string described(const py::array& array) {
+    return py::str("{} of shape {}{}")
+        .format(array.dtype(), array.attr("shape"),
+                (array.flags() & py::array::c_style) != 0 ? "" : ", not C-contiguous");
+}
+
+// Only C++ knows that the data of inputs is not written to: numpy's read-only arrays are welcome.
+Image image_from_array(const std::string& name, const py::array& array) {
+    const std::string expected =
+        name + ": expected a C-contiguous float32 array of shape (height, width, channels), got ";
+    if (!py::isinstance<py::array_t<float>>(array)) throw py::type_error(expected + described(array));
+    constexpr py::ssize_t limit = std::numeric_limits<int>::max();
+    if (array.ndim() != 3 || (array.flags() & py::array::c_style) == 0 || array.shape(0) > limit ||
+        array.shape(1) > limit || array.shape(2) > limit) {
+        throw py::value_error(expected + described(array));
+    }
+    return {.data = static_cast<float*>(const_cast<void*>(array.data())),
+            .height = static_cast<int>(array.shape(0)),
+            .width = static_cast<int>(array.shape(1)),
+            .channels = static_cast<int>(array.shape(2))};
+}
+
+using OptionalArray = std::optional<py::array>;
+
+// Takes arrays for a buffer and checks that they fit together.
+Buffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a, const OptionalArray& half_b,
+                          const OptionalArray& variance) {
+    Buffer buffer{.mean = image_from_array("mean", mean), .half_a = {}, .half_b = {}, .variance = {}};
+    const auto take = [&](const std::string& name, const OptionalArray& array, Image& image) {
+        if (!array) return;
+        image = image_from_array(name, *array);
+        if (!array->attr("shape").equal(mean.attr("shape"))) {
+            throw py::value_error(name + ": expected the shape of the others, " +
+                                  std::string(py::str(mean.attr("shape"))) + ", got " +
+                                  std::string(py::str(array->attr("shape"))));
+        }
+    };
+    take("half_a", half_a, buffer.half_a);
+    take("half_b", half_b, buffer.half_b);
+    take("variance", variance, buffer.variance);
+    return buffer;
+}
+
+Array array_like(const Image& image) { return Array({image.height, image.width, image.channels}); }
+
+Quantity quantity_from_name(const std::string& name) {
+    static const std::map<std::string, Quantity> quantities{{"color", Quantity::color},
+                                                            {"albedo", Quantity::albedo},
+                                                            {"normal", Quantity::normal},
+                                                            {"depth", Quantity::depth},
+                                                            {"visibility", Quantity::visibility}};
+    const auto found = quantities.find(name);
+    if (found == quantities.end()) {
+        throw py::value_error("quantity: expected color, albedo, normal, depth or visibility, got " + name);
+    }
+    return found->second;
+}
+
+// Returns the planes, those with defects as mended copies, and the defects of each.
+py::tuple sanitize(const std::string& quantity_name, const py::array& mean, const OptionalArray& half_a,
+                   const OptionalArray& half_b, const OptionalArray& variance, int threads) {
+    const Quantity quantity = quantity_from_name(quantity_name);
+    Buffer buffer = buffer_from_arrays(mean, half_a, half_b, variance);
+    BufferDefects defects;
+    {
+        const py::gil_scoped_release release;
+        defects = find_defects(buffer, quantity, threads);
+    }
+    const auto copied_if_defective = [](const OptionalArray& array, const Defects& found, Image& image) {
+        if (!array || !found.any()) return py::object(array ? py::object(*array) : py::none());
+        const Array copy = array_like(image);
+        std::copy_n(image.data, image.size(), static_cast<float*>(copy.request().ptr));
+        image.data = static_cast<float*>(copy.request().ptr);
+        return py::object(copy);
+    };
+    const py::tuple planes = py::make_tuple(copied_if_defective(mean, defects.mean, buffer.mean),
+                                            copied_if_defective(half_a, defects.half_a, buffer.half_a),
+                                            copied_if_defective(half_b, defects.half_b, buffer.half_b),
+                                            copied_if_defective(variance, defects.variance, buffer.variance));
+    {
+        const py::gil_scoped_release release;
+        mend(buffer, quantity);
+    }
+    return py::make_tuple(planes,
+                          py::make_tuple(defects.mean, defects.half_a, defects.half_b, defects.variance));
+}
+
+Array halves_variance_array(const py::array& half_a, const py::array& half_b, int threads) {
+    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, std::nullopt);
+    Array out = array_like(buffer.half_a);
+    const Image image = image_from_array("out", out);
+    const py::gil_scoped_release release;
+    halves_variance(buffer.half_a, buffer.half_b, image, threads);
+    return out;
+}
+
+Array calibrate_variance_array(const py::array& variance, const py::array& half_a, const py::array& half_b,
+                               int threads) {
+    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
+    Array out = array_like(buffer.half_a);
+    const Image image = image_from_array("out", out);
+    const py::gil_scoped_release release;
+    calibrate_variance(buffer.variance, buffer.half_a, buffer.half_b, image, threads);
+    return out;
+}
+
+HalvesTest test_halves_arrays(const py::array& half_a, const py::array& half_b, const OptionalArray& variance,
+                              int threads) {
+    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
+    const py::gil_scoped_release release;
+    return test_halves(buffer.half_a, buffer.half_b, buffer.variance, threads);
+}
+
+py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_a, const py::array& half_b,
+                                   const OptionalArray& variance, int threads) {
+    const Buffer in = buffer_from_arrays(mean, half_a, half_b, variance);
+    const std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
+                                      array_like(in.mean)};
+    const Buffer out = buffer_from_arrays(planes[0], planes[1], planes[2], planes[3]);
+    {
+        const py::gil_scoped_release release;
+        prefilter_feature(in, out, threads);
+    }
+    return py::make_tuple(planes[0], planes[1], planes[2], planes[3]);
+}
+
+}  // namespace
+}  // namespace tungsten_dip
+
+PYBIND11_MODULE(_core, module) {
+    using namespace tungsten_dip;  // NOLINT(google-build-using-namespace): a scope of declarations alone
+    module.doc() = "The core of tungsten-dip in C++. _core.pyi documents it; use tungsten_dip.buffers.";
+    module.attr("__version__") = TUNGSTEN_DIP_VERSION;
+
+    py::class_<Defects>(module, "Defects")
+        .def_readonly("nan", &Defects::nan)
+        .def_readonly("infinite", &Defects::infinite)
+        .def_readonly("negative", &Defects::negative);
+    py::class_<HalvesTest>(module, "HalvesTest")
+        .def_readonly("correlation", &HalvesTest::correlation)
+        .def_readonly("variance_ratio", &HalvesTest::variance_ratio)
+        .def_readonly("pixels_used", &HalvesTest::pixels_used)
+        .def_readonly("independent", &HalvesTest::independent);
+
+    module.def("sanitize", &sanitize, py::arg("quantity"), py::arg("mean"), py::arg("half_a"),
+               py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
+    module.def("halves_variance", &halves_variance_array, py::arg("half_a"), py::arg("half_b"),
+               py::arg("threads") = 0);
+    module.def("calibrate_variance", &calibrate_variance_array, py::arg("variance"), py::arg("half_a"),
+               py::arg("half_b"), py::arg("threads") = 0);
+    module.def("test_halves", &test_halves_arrays, py::arg("half_a"), py::arg("half_b"), py::arg("variance"),
+               py::arg("threads") = 0);
+    module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),
+               py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
+}

@@ -1,5 +1,122 @@
-// The core of tungsten-dip: what is known of a render's noise, and how to mend and pre-filter its buffers.
+// The core of tungsten-dip: the buffers of a render, how they are mended, what is known of their noise, and
+// the pre-filtering of features. Free of Python and of any renderer.
+//
+// Images are float32, C-contiguous, shape (height, width, channels), row 0 at the top; colour is linear
+// radiance. `threads` 0 uses every core; no result depends on it, to the bit.
 #pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <type_traits>
+
 namespace tungsten_dip {
-int thread_count(int threads);
-}
+
+// A view of pixels that somebody else owns. Without data the image is unknown.
+template <typename T>
+struct ImageView {
+    T* data = nullptr;
+    int height = 0;
+    int width = 0;
+    int channels = 0;
+
+    [[nodiscard]] bool known() const { return data != nullptr; }
+    [[nodiscard]] std::ptrdiff_t row_size() const { return static_cast<std::ptrdiff_t>(width) * channels; }
+    [[nodiscard]] std::ptrdiff_t size() const { return height * row_size(); }
+    [[nodiscard]] T* row(int y) const { return data + y * row_size(); }
+    [[nodiscard]] T& at(int y, int x, int c) const {
+        return row(y)[static_cast<std::ptrdiff_t>(x) * channels + c];
+    }
+
+    operator ImageView<const T>() const  // NOLINT(google-explicit-constructor): reading is always allowed
+        requires(!std::is_const_v<T>)
+    {
+        return {data, height, width, channels};
+    }
+};
+using Image = ImageView<float>;
+using ConstImage = ImageView<const float>;
+
+// One quantity: the mean over all samples, the means of two disjoint halves of them, the variance of the
+// mean. All known images have the same shape.
+struct Buffer {
+    Image mean;
+    Image half_a;
+    Image half_b;
+    Image variance;
+
+    [[nodiscard]] bool has_halves() const { return half_a.known() && half_b.known(); }
+};
+
+enum class Quantity : std::uint8_t { color, albedo, normal, depth, visibility };
+
+// Calls body(0) ... body(count - 1), in any order, from several threads. The first exception is thrown again
+// here.
+void parallel_for(int count, int threads, const std::function<void(int)>& body);
+
+// --- sanitize.cpp
+// ---------------------------------------------------------------------------------------------
+
+// How many values of an image cannot be meant. A depth of 1e9 and more counts as infinite: renderers mark the
+// sky so (Blender 1e10, Arnold 1e30). Normals may be negative; no other quantity and no variance may.
+struct Defects {
+    std::int64_t nan = 0;
+    std::int64_t infinite = 0;
+    std::int64_t negative = 0;
+
+    [[nodiscard]] bool any() const { return nan + infinite + negative > 0; }
+};
+struct BufferDefects {
+    Defects mean;
+    Defects half_a;
+    Defects half_b;
+    Defects variance;
+};
+
+BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads);
+
+// Replaces every defect in place and nothing else; images without defects are not written to.
+// - negative means become 0, and so does an infinite depth: the ray left the scene;
+// - mean, half_a and half_b follow from one another (mean = (half_a + half_b) / 2) where two of them are
+// sane;
+// - a variance (a negative one as well) follows from the halves: (half_a - half_b)^2 / 4, averaged over 3x3
+// pixels
+//   but no less than the pixel's own, since a firefly's variance is what overflows half floats;
+// - else the median (for a variance: the maximum) of the sane pixels around; 0 more than 16 pixels away from
+// any.
+void mend(const Buffer& buffer, Quantity quantity);
+
+// --- statistics.cpp
+// -------------------------------------------------------------------------------------------
+
+// (half_a - half_b)^2 / 4: an unbiased, very noisy estimate of the variance of the mean of independent
+// halves.
+void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int threads);
+
+// The mean over a square window of (2 radius + 1)^2 pixels, clipped at the borders of the image.
+void box_mean(ConstImage in, int radius, Image out, int threads);
+
+// The sample variance scaled so that its local mean (21x21 pixels) is that of the halves' variance: the
+// former is the less noisy, but wrong by a factor where samples are not independent (Rousselle et al. 2012,
+// "Adaptive Rendering with Non-Local Means Filtering", on low-discrepancy samples).
+void calibrate_variance(ConstImage variance, ConstImage half_a, ConstImage half_b, Image out, int threads);
+
+// Whether the noise of two halves is independent, as everything that scores one half by the other assumes.
+struct HalvesTest {
+    double correlation = 0;     // of the two halves' errors; NaN if nothing in the image tells
+    double variance_ratio = 0;  // mean sample variance of the mean over the halves' one; NaN if unknown
+    std::int64_t pixels_used = 0;
+    bool independent = false;  // false as well where nothing in the image tells
+};
+HalvesTest test_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads);
+
+// --- prefilter.cpp
+// --------------------------------------------------------------------------------------------
+
+// Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
+// al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
+// `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
+// after filtering. A value whose halves agree and whose variance is 0 is passed through unchanged.
+void prefilter_feature(const Buffer& in, const Buffer& out, int threads);
+
+}  // namespace tungsten_dip

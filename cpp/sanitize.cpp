@@ -1,0 +1,210 @@
+// Finds and mends values that no renderer can have meant. Finite values are never clamped, however large.
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "core.hpp"
+
+namespace tungsten_dip {
+namespace {
+
+constexpr float infinite_depth = 1e9F;
+constexpr int reach = 16;  // how far a sane pixel may be from the one it mends
+
+struct Rules {
+    bool nonnegative;
+    float infinite_from;  // values of this magnitude and more stand for infinity
+
+    [[nodiscard]] bool sane(float value) const {
+        return std::abs(value) < infinite_from && (value >= 0 || !nonnegative);
+    }
+};
+
+constexpr Rules variance_rules{.nonnegative = true, .infinite_from = std::numeric_limits<float>::infinity()};
+
+Rules value_rules(Quantity quantity) {
+    return {.nonnegative = quantity != Quantity::normal,
+            .infinite_from = quantity == Quantity::depth ? infinite_depth : variance_rules.infinite_from};
+}
+
+Defects find_defects(ConstImage image, Rules rules, int threads) {
+    if (!image.known()) return {};
+    std::vector<Defects> rows(static_cast<std::size_t>(image.height));
+    parallel_for(image.height, threads, [&](int y) {
+        Defects found;
+        for (const float* value = image.row(y); value != image.row(y) + image.row_size(); ++value) {
+            if (rules.sane(*value)) continue;
+            if (std::isnan(*value)) {
+                ++found.nan;
+            } else if (std::abs(*value) >= rules.infinite_from) {
+                ++found.infinite;
+            } else {
+                ++found.negative;
+            }
+        }
+        rows[static_cast<std::size_t>(y)] = found;
+    });
+    Defects sum;
+    for (const Defects& row : rows) {
+        sum.nan += row.nan;
+        sum.infinite += row.infinite;
+        sum.negative += row.negative;
+    }
+    return sum;
+}
+
+struct Position {
+    int y, x, c;
+};
+
+// Calls visit(value) for the pixels of the 3x3 window around a position that are inside the image.
+template <typename Visit>
+void for_neighbourhood(const Image& image, Position at, const Visit& visit) {
+    for (int y = std::max(at.y - 1, 0); y <= std::min(at.y + 1, image.height - 1); ++y) {
+        for (int x = std::max(at.x - 1, 0); x <= std::min(at.x + 1, image.width - 1); ++x) visit(y, x);
+    }
+}
+
+template <typename Visit>
+void for_each_position(const Image& image, const Visit& visit) {
+    for (int y = 0; y < image.height; ++y) {
+        for (int x = 0; x < image.width; ++x) {
+            for (int c = 0; c < image.channels; ++c) visit(Position{.y = y, .x = x, .c = c});
+        }
+    }
+}
+
+float lower_median(std::array<float, 9>& values, int count) {
+    const auto middle = values.begin() + (count - 1) / 2;
+    std::nth_element(values.begin(), middle, values.begin() + count);
+    return *middle;
+}
+
+float maximum(std::array<float, 9>& values, int count) {
+    return *std::max_element(values.begin(), values.begin() + count);
+}
+
+// Fills non-finite values from the finite ones around, ring by ring.
+template <typename Pick>
+void fill_from_neighbours(const Image& image, std::vector<Position> pending, const Pick& pick) {
+    std::vector<float> filled;
+    for (int ring = 0; ring < reach && !pending.empty(); ++ring) {
+        filled.clear();
+        for (const Position at : pending) {
+            std::array<float, 9> sane{};
+            int count = 0;
+            for_neighbourhood(image, at, [&](int y, int x) {
+                const float value = image.at(y, x, at.c);
+                if (std::isfinite(value)) sane.at(static_cast<std::size_t>(count++)) = value;
+            });
+            filled.push_back(count > 0 ? pick(sane, count) : std::numeric_limits<float>::quiet_NaN());
+        }
+        std::vector<Position> left;
+        for (std::size_t i = 0; i < pending.size(); ++i) {
+            const Position at = pending[i];
+            image.at(at.y, at.x, at.c) = filled[i];
+            if (!std::isfinite(filled[i])) left.push_back(at);
+        }
+        pending = std::move(left);
+    }
+    for (const Position at : pending) image.at(at.y, at.x, at.c) = 0;
+}
+
+// Sets negative values to 0, and infinite ones as well if asked to.
+void zero(const Image& image, Rules rules, bool infinite) {
+    for (float* value = image.data; value != image.data + image.size(); ++value) {
+        if (rules.sane(*value) || std::isnan(*value)) continue;
+        if (std::abs(*value) < rules.infinite_from || infinite) *value = 0;
+    }
+}
+
+void mend_values(const Buffer& buffer, Quantity quantity) {
+    const Rules rules = value_rules(quantity);
+    const bool is_depth = quantity == Quantity::depth;
+    if (buffer.half_a.known()) zero(buffer.half_a, rules, is_depth);
+    if (buffer.half_b.known()) zero(buffer.half_b, rules, is_depth);
+    // The mean of halves of which one met something and one did not is their mean, not the sky.
+    zero(buffer.mean, rules, is_depth && !buffer.has_halves());
+
+    std::vector<Position> mean_left;
+    std::vector<Position> a_left;
+    std::vector<Position> b_left;
+    for_each_position(buffer.mean, [&](Position at) {
+        float unknown = std::numeric_limits<float>::quiet_NaN();
+        float& mean = buffer.mean.at(at.y, at.x, at.c);
+        float& a = buffer.half_a.known() ? buffer.half_a.at(at.y, at.x, at.c) : unknown;
+        float& b = buffer.half_b.known() ? buffer.half_b.at(at.y, at.x, at.c) : unknown;
+        const bool mean_sane = rules.sane(mean);
+        const bool a_sane = rules.sane(a);
+        const bool b_sane = rules.sane(b);
+        const auto other_half = [&](float half) {
+            const float other = 2 * mean - half;
+            return rules.nonnegative ? std::max(other, 0.0F) : other;
+        };
+        if (!mean_sane && a_sane && b_sane) {
+            mean = a / 2 + b / 2;
+        } else if (mean_sane && a_sane && !b_sane && buffer.half_b.known()) {
+            b = other_half(a);
+        } else if (mean_sane && !a_sane && b_sane && buffer.half_a.known()) {
+            a = other_half(b);
+        }
+        const auto leave_to_neighbours = [&](float& value, std::vector<Position>& left) {
+            if (rules.sane(value)) return;
+            value = std::numeric_limits<float>::quiet_NaN();
+            left.push_back(at);
+        };
+        leave_to_neighbours(mean, mean_left);
+        if (buffer.half_a.known()) leave_to_neighbours(a, a_left);
+        if (buffer.half_b.known()) leave_to_neighbours(b, b_left);
+    });
+    fill_from_neighbours(buffer.mean, std::move(mean_left), lower_median);
+    fill_from_neighbours(buffer.half_a, std::move(a_left), lower_median);
+    fill_from_neighbours(buffer.half_b, std::move(b_left), lower_median);
+}
+
+void mend_variance(const Buffer& buffer) {
+    const Image& variance = buffer.variance;
+    std::vector<Position> left;
+    for_each_position(variance, [&](Position at) {
+        float& value = variance.at(at.y, at.x, at.c);
+        if (variance_rules.sane(value)) return;
+        value = std::numeric_limits<float>::quiet_NaN();
+        if (buffer.has_halves()) {
+            double sum = 0;
+            int count = 0;
+            const auto squared = [&](int y, int x) {
+                const double difference =
+                    static_cast<double>(buffer.half_a.at(y, x, at.c)) - buffer.half_b.at(y, x, at.c);
+                return difference * difference / 4;
+            };
+            for_neighbourhood(variance, at, [&](int y, int x) {
+                sum += squared(y, x);
+                ++count;
+            });
+            const double estimate = std::max(sum / count, squared(at.y, at.x));
+            value = static_cast<float>(std::min<double>(estimate, std::numeric_limits<float>::max()));
+        } else {
+            left.push_back(at);
+        }
+    });
+    fill_from_neighbours(variance, std::move(left), maximum);
+}
+
+}  // namespace
+
+BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads) {
+    const Rules rules = value_rules(quantity);
+    return {.mean = find_defects(buffer.mean, rules, threads),
+            .half_a = find_defects(buffer.half_a, rules, threads),
+            .half_b = find_defects(buffer.half_b, rules, threads),
+            .variance = find_defects(buffer.variance, variance_rules, threads)};
+}
+
+void mend(const Buffer& buffer, Quantity quantity) {
+    mend_values(buffer, quantity);
+    if (buffer.variance.known()) mend_variance(buffer);
+}
+
+}  // namespace tungsten_dip
