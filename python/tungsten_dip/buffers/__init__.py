@@ -1,5 +1,24 @@
-"""Buffers of a render: the data model, mending, statistics of the noise, pre-filtering of features."""
+"""Buffers of a render: the data model, files, mending, statistics of the noise, pre-filtering of features."""
 
+from tungsten_dip.buffers.atomic import check_writable, replacing
+from tungsten_dip.buffers.image_file import read_image, write_image
+from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.read import read_buffers
+from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 
-__all__ = ["CHANNELS", "FEATURES", "Buffer", "FloatImage", "RenderBuffers"]
+__all__ = [
+    "CHANNELS",
+    "FEATURES",
+    "PLANES",
+    "Buffer",
+    "FloatImage",
+    "RenderBuffers",
+    "check_writable",
+    "read_buffers",
+    "read_image",
+    "replacing",
+    "write_denoised",
+    "write_image",
+    "write_tungsten_folder",
+]

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.errors import InputError
+
+if TYPE_CHECKING:
+    from tungsten_dip.buffers.source import Source
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -55,7 +58,8 @@ class RenderBuffers:
     """Everything a renderer tells of one image.
 
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies. ``alpha``
-    has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the output.
+    has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the output, ``source``
+    the channels of the file that was read, in their own pixel types, for the same purpose.
 
     Raises InputError if the shapes or the channel counts do not fit together.
     """
@@ -68,6 +72,7 @@ class RenderBuffers:
     spp: float | FloatImage | None = None
     alpha: FloatImage | None = None
     attributes: dict[str, Any] = field(default_factory=dict)
+    source: Source | None = None
 
     def __post_init__(self) -> None:
         expected = self.color.mean.shape[:2]

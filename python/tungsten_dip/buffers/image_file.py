@@ -1,0 +1,184 @@
+"""Image files: decoded without loss into channels of their own pixel type, and back.
+
+OpenImageIO decodes: it checks headers against the size of the file before it allocates, and reports errors
+where OpenEXR's module prints them. OpenEXR reads and writes EXR headers, whose attributes it keeps in their
+own types.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
+
+from tungsten_dip.buffers.atomic import replacing
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.source import Channel, Part
+from tungsten_dip.errors import InputError
+
+log = logging.getLogger(__name__)
+
+RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
+"""Formats that hold linear radiance, in the order of preference."""
+
+MAX_PIXELS = 2**28
+"""The largest image read: 16384 x 16384. One channel of it is 1 GiB of float32."""
+
+# What the encoder decides anew, or what describes the encoding alone.
+_ENCODING = {"channels", "chunkCount", "compression", "lineOrder", "name", "tiles", "type", "version"}
+
+
+def read_parts(path: Path) -> tuple[Part, ...]:
+    """Read every part of an .exr file, or the one image of a .pfm or .hdr file. Mipmaps are left out.
+
+    Raises InputError if the file is missing, no such image, deep, truncated or larger than MAX_PIXELS.
+    """
+    if path.suffix.lower() not in RADIANCE_SUFFIXES:
+        raise InputError(
+            f"{path}: expected an image in {', '.join(RADIANCE_SUFFIXES)}, which hold linear radiance"
+        )
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the name")
+    config = oiio.ImageSpec()
+    config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
+    image = oiio.ImageInput.open(str(path), config)
+    if image is None:
+        raise InputError(
+            f"{path}: cannot be read as an image ({_one_line(oiio.geterror())}); render it again"
+        )
+    try:
+        parts: list[Part] = []
+        while image.seek_subimage(len(parts), 0):
+            parts.append(_part(path, image, len(parts)))
+    finally:
+        image.close()
+    if path.suffix.lower() != ".exr":
+        return tuple(parts)
+    try:
+        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{path}: has a damaged header ({_one_line(str(error))}); render it again"
+        ) from error
+    return tuple(
+        Part(part.channels, {key: value for key, value in header.items() if key not in _ENCODING}, part.name)
+        for part, header in zip(parts, headers, strict=True)
+    )
+
+
+def read_image(path: str | Path) -> FloatImage:
+    """Read the picture that a viewer would show: the top-level R, G, B (or Y) of the first part.
+
+    Returns linear radiance, float32, shape (height, width, 3).
+
+    Raises InputError as read_parts does, or if there is no such channel.
+    """
+    path = Path(path)
+    channels = read_parts(path)[0].channels
+    names = next((names for names in ("RGB", "Y") if all(name in channels for name in names)), None)
+    if names is None:
+        raise InputError(f"{path}: expected channels R, G, B or Y, found {', '.join(channels)}")
+    image = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
+    return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+
+
+def write_exr(path: Path, parts: Iterable[Part]) -> None:
+    """Write the parts, every channel in its own pixel type, compressed without loss, whole or not at all.
+
+    Attributes that EXR cannot hold are left out and logged. Raises InputError if the file cannot be written.
+    """
+    encoded = []
+    for part in parts:
+        header = _storable(part.attributes)
+        header.update(type=OpenEXR.scanlineimage, compression=OpenEXR.ZIP_COMPRESSION)
+        # OpenEXR turns the values of the dictionary it is given into objects of its own, hence the copy.
+        channels = {name: np.ascontiguousarray(channel) for name, channel in part.channels.items()}
+        encoded.append(OpenEXR.Part(header, channels, part.name))
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        OpenEXR.File(encoded).write(stream)
+
+
+def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
+    """Write one picture of shape (height, width, 1 or 3), whole or not at all.
+
+    .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
+    (clipped, 8 bit). Raises InputError if the suffix is another one or the file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (*RADIANCE_SUFFIXES, ".png"):
+        raise InputError(f"{path}: expected a name that ends in {', '.join(RADIANCE_SUFFIXES)} or .png")
+    if suffix == ".exr":
+        names = "RGB" if image.shape[2] == 3 else "Y"
+        channels = {name: image[..., index].astype(np.float32) for index, name in enumerate(names)}
+        write_exr(path, [Part(channels)])
+        return
+    if suffix == ".hdr":
+        image = np.broadcast_to(image, (*image.shape[:2], 3))
+    height, width, count = image.shape
+    spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")
+    spec["pnm:pfmflip"] = 1
+    with replacing(path) as temporary:
+        output = oiio.ImageOutput.create(str(temporary))
+        pixels = np.ascontiguousarray(image, dtype=np.float32)
+        if output is None:
+            raise OSError(_one_line(oiio.geterror()))
+        written = output.open(str(temporary), spec) and output.write_image(pixels)
+        closed = output.close()
+        # A full disk may show in the message alone: the PNG encoder then still claims success.
+        message = output.geterror()
+        if not (written and closed) or message:
+            raise OSError(_one_line(message))
+
+
+def _part(path: Path, image: Any, index: int) -> Part:
+    spec = image.spec()
+    if spec.deep:
+        raise InputError(f"{path}: holds deep pixels; expected one colour per pixel, flatten it first")
+    if spec.width * spec.height > MAX_PIXELS:
+        raise InputError(
+            f"{path}: expected at most {MAX_PIXELS} pixels, got {spec.width} x {spec.height}; crop it first"
+        )
+    if spec.nchannels == 0:
+        raise InputError(f"{path}: holds no channels; render it again")
+    formats = [spec.channelformat(channel) for channel in range(spec.nchannels)]
+    channels: dict[str, Channel] = {}
+    begin = 0
+    while begin < spec.nchannels:
+        # One call per run of equal pixel types: a mixed call would convert all to one type.
+        end = next((c for c in range(begin, spec.nchannels) if formats[c] != formats[begin]), spec.nchannels)
+        pixels = image.read_image(index, 0, begin, end, formats[begin])
+        if pixels is None:
+            raise InputError(
+                f"{path}: is damaged or truncated ({_one_line(image.geterror())}); render or copy it again"
+            )
+        planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+        channels.update(zip(spec.channelnames[begin:end], planes, strict=True))
+        begin = end
+    return Part(channels, name=spec.getattribute("oiio:subimagename") or "")
+
+
+def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
+    kept = {}
+    for name, value in attributes.items():
+        if name in _ENCODING:
+            continue
+        try:
+            pixel = {"Y": np.zeros((1, 1), np.float32)}
+            if name not in ("dataWindow", "displayWindow"):
+                OpenEXR.File({name: value, "type": OpenEXR.scanlineimage}, pixel).write(io.BytesIO())
+            kept[name] = value
+        except (RuntimeError, TypeError, ValueError) as error:
+            log.warning("attribute %s is left out: %s", name, _one_line(str(error)))
+    return kept
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split()) or "no reason given"

@@ -1,0 +1,199 @@
+"""Which layer of an image holds which quantity: the names that renderers give to their layers.
+
+| renderer | colour | features |
+|---|---|---|
+| Tungsten (one file each) | color | albedo, normal, depth, visibility, each also with A, B, Variance |
+| Blender | ViewLayer.Noisy Image, .Combined | .Denoising Albedo, .DiffCol, .Denoising Normal, .Depth |
+| Arnold | RGBA (top level) | denoise_albedo, diffuse_albedo, N, Z, and N_noice, Z_noice |
+| pbrt-v4 | top level | Albedo, Ns, N, Variance (of one sample; attribute samplesPerPixel) |
+| Mitsuba 3 | top level | as the user named them: albedo, nn, sh_normal, dd.y, depth |
+| ours | noisy (top level is the denoised picture) | as in the input |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from tungsten_dip.buffers.model import CHANNELS
+from tungsten_dip.errors import InputError
+
+ALIASES = {
+    "color": ("noisy image", "noisy", "color", "", "rgba", "beauty", "combined", "ci"),
+    "albedo": ("denoising albedo", "denoise_albedo", "albedo", "diffuse_albedo", "diffcol", "diffuse color"),
+    "normal": ("denoising normal", "n_noice", "normal", "normals", "sh_normal", "ns", "nn", "n"),
+    "depth": ("denoising depth", "z_noice", "depth", "dd.y", "dd", "z"),
+    "visibility": ("visibility",),
+    "spp": ("spp",),
+}
+"""Layer names of every quantity in lower case, best first. The empty name is the top level."""
+
+PLANES = {"mean": "", "half_a": "A", "half_b": "B", "variance": "Variance"}
+"""The fields of a Buffer, and what Tungsten appends to a quantity's name for each."""
+
+MAP_KEYS = (*(quantity + suffix for quantity in CHANNELS for suffix in PLANES.values()), "alpha")
+"""What a user can say with --map: color, colorA, colorB, colorVariance, albedo, ..., alpha."""
+
+NOTHING = "none"
+"""The value of --map that says: do not use this quantity."""
+
+_COMPONENTS = ("RGB", "XYZ", ("RED", "GREEN", "BLUE"))
+
+# The second moments that Mitsuba's integrator "moment" writes beside every layer.
+_NO_LAYER = "m2_"
+
+Layers = dict[str, dict[str, str]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was recognised: channel names per key of --map, and the layers that nobody claimed."""
+
+    channels: dict[str, tuple[str, ...]]
+    ignored: tuple[str, ...]
+
+
+def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], default: str = "") -> Found:
+    """Decide what is what, from the names of the channels and from what the user said.
+
+    A value of ``mapping`` is a layer, a channel, several channels joined by commas, or "none". ``default`` is
+    the layer that is the colour if none has a telling name, unless its name tells of something else.
+
+    Raises InputError if a mapping names what is not there, or if no colour is found.
+    """
+    names = list(channel_names)
+    layers = _layers(names)
+    unknown = [key for key in mapping if key not in MAP_KEYS]
+    if unknown:
+        raise InputError(f"--map {unknown[0]}=...: expected one of {', '.join(MAP_KEYS)}")
+    channels: dict[str, tuple[str, ...]] = {}
+    color_prefix = ""
+    for quantity in CHANNELS:
+        layer: str | None = None
+        if quantity in mapping:
+            if mapping[quantity] == NOTHING:
+                continue
+            channels[quantity] = _mapped(quantity, mapping[quantity], names, layers)
+            layer = mapping[quantity]
+        else:
+            match = _match(quantity, layers, color_prefix)
+            if match is None and quantity == "color" and _may_be_color(default, layers):
+                match = default, ""
+            if match is None:
+                continue
+            layer, prefix = match
+            channels[quantity] = _ordered(layers[layer])
+            if quantity == "color":
+                color_prefix = prefix
+        _add_planes(channels, quantity, layer, names, layers, mapping)
+    if "color" not in channels:
+        found = ", ".join(layers) or "nothing"
+        raise InputError(f"no colour: expected R, G, B or layer color, found {found}; use --map color=LAYER")
+    alpha = _alpha(channels["color"], names, layers, mapping)
+    if alpha is not None:
+        channels["alpha"] = (alpha,)
+    spp = _match("spp", layers, color_prefix)
+    if spp is not None:
+        channels["spp"] = _ordered(layers[spp[0]])
+    for key, value in mapping.items():
+        if value != NOTHING and key not in channels:
+            raise InputError(f"--map {key}={value}: there is no mean that this belongs to; map that too")
+    used = {name for group in channels.values() for name in group}
+    ignored = tuple(
+        layer or "top level" for layer, components in layers.items() if used.isdisjoint(components.values())
+    )
+    return Found(channels, ignored)
+
+
+def _layers(names: list[str]) -> Layers:
+    """Group channels: layer -> component in upper case -> channel."""
+    layers: Layers = {}
+    for name in names:
+        layer, _, component = name.rpartition(".")
+        if not layer and component.upper() not in ("R", "G", "B", "A", "Y"):
+            layer, component = name, ""  # a bare Z, depth or id is a layer by itself
+        layers.setdefault(layer, {})[component.upper()] = name
+    for layer, components in list(layers.items()):
+        if {"R", "G", "B"} <= components.keys():
+            for component in components.keys() - {"R", "G", "B", "A"}:
+                layers[f"{layer}.{component}"] = {"": components.pop(component)}
+    return layers
+
+
+def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] | None:
+    """Find the best layer, and what stands before the alias in its name (a Blender view layer)."""
+    matches = []
+    for order, layer in enumerate(layers):
+        name = layer.lower()
+        if name.startswith(_NO_LAYER) or not _ordered(layers[layer]):
+            continue
+        for rank, alias in enumerate(ALIASES[quantity]):
+            if name == alias or (alias and name.endswith("." + alias)):
+                prefix = name[: len(name) - len(alias)]
+                # Blender's "Composite" is what its compositor made, perhaps graded already.
+                strange = prefix == "composite." if quantity == "color" else prefix != color_prefix
+                matches.append((strange, rank, order, layer, prefix))
+                break
+    return min(matches)[3:] if matches else None
+
+
+def _may_be_color(layer: str, layers: Layers) -> bool:
+    named_for_another = any(_match(quantity, {layer: {"": ""}}, "") for quantity in CHANNELS)
+    return len(_ordered(layers.get(layer, {}))) == 3 and not named_for_another
+
+
+def _ordered(components: dict[str, str]) -> tuple[str, ...]:
+    """Channels of a layer without alpha: in the order of a known triple, or the only one; else none."""
+    for triple in _COMPONENTS:
+        if all(component in components for component in triple):
+            return tuple(components[component] for component in triple)
+    rest = [name for component, name in components.items() if component != "A"]
+    return tuple(rest) if len(rest) == 1 else ()
+
+
+def _mapped(key: str, value: str, names: list[str], layers: Layers) -> tuple[str, ...]:
+    channels = tuple(part.strip() for part in value.split(","))
+    if all(channel in names for channel in channels):
+        return channels
+    layer = next((layer for layer in layers if layer == value or layer.lower() == value.lower()), None)
+    if layer is None:
+        raise InputError(
+            f"--map {key}={value}: no such layer or channel; there are {', '.join(filter(None, layers))}"
+        )
+    ordered = _ordered(layers[layer])
+    if not ordered:
+        raise InputError(
+            f"--map {key}={value}: expected R, G, B or X, Y, Z or one channel, found "
+            f"{', '.join(layers[layer].values())}; name the channels, joined by commas"
+        )
+    return ordered
+
+
+def _add_planes(
+    channels: dict[str, tuple[str, ...]],
+    quantity: str,
+    layer: str,
+    names: list[str],
+    layers: Layers,
+    mapping: Mapping[str, str],
+) -> None:
+    """Add halves and variance of a quantity whose mean is ``layer``."""
+    for suffix in list(PLANES.values())[1:]:
+        key = quantity + suffix
+        if key in mapping:
+            if mapping[key] != NOTHING:
+                channels[key] = _mapped(key, mapping[key], names, layers)
+            continue
+        wanted = {name.lower() for name in (quantity + suffix, layer + suffix, f"{layer}_{suffix}")}
+        match = next((other for other in layers if other.lower() in wanted and _ordered(layers[other])), None)
+        if match is not None:
+            channels[key] = _ordered(layers[match])
+
+
+def _alpha(
+    color: tuple[str, ...], names: list[str], layers: Layers, mapping: Mapping[str, str]
+) -> str | None:
+    if "alpha" in mapping:
+        return None if mapping["alpha"] == NOTHING else _mapped("alpha", mapping["alpha"], names, layers)[0]
+    own = next(components for components in layers.values() if color[0] in components.values())
+    return own.get("A") or layers.get("", {}).get("A")

@@ -1,0 +1,261 @@
+"""Buffers from files: a folder of Tungsten's buffers, a scene that names them, or one image with many layers.
+
+A file written by ``write_denoised`` reads like the input it was made from: its colour is the noisy picture
+(layer ``noisy``), not the denoised one at the top level.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
+from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers
+from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
+from tungsten_dip.errors import InputError
+
+log = logging.getLogger(__name__)
+
+_SUFFIXES = tuple(PLANES.values())
+_CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix in _SUFFIXES} | {
+    "alpha": 1,
+    "spp": 1,
+}
+
+
+def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> RenderBuffers:
+    """Read what a renderer saved and log which layer was taken for which quantity.
+
+    ``path`` is a folder with files named as Tungsten names them (``color.exr``, ``colorA.exr``, ...; also
+    .pfm and .hdr), a Tungsten scene whose ``renderer.output_buffers`` names them, or one image, as a rule a
+    multi-layer or multi-part EXR. ``mapping`` settles what its names leave open: ``{"color": "beauty"}``.
+    Its keys are the quantities and ``alpha``, quantities also with ``A``, ``B`` (halves) and ``Variance``
+    (of the mean). A value is a layer, a channel, channels joined by commas, for a folder a file name, or
+    ``none``. Values of pixels are taken as they are: nothing is mended.
+
+    Raises InputError if a file is missing, damaged or no image, if sizes differ, or if there is no colour.
+    """
+    path = Path(path)
+    mapping = dict(mapping or {})
+    if path.is_dir():
+        return _from_images(path, _files_of_folder(path, mapping))
+    if path.suffix.lower() == ".json":
+        if mapping:
+            raise InputError(f"{path}: a scene names its buffers itself; use --map with a folder or an image")
+        return _from_images(path, _files_of_scene(path))
+    source, attributes = _unwrapped(path, read_parts(path))
+    return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
+
+
+def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path]:
+    try:
+        present = sorted(file for file in folder.iterdir() if file.suffix.lower() in RADIANCE_SUFFIXES)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be listed ({error.strerror}); check its permissions") from error
+    present.sort(key=lambda file: RADIANCE_SUFFIXES.index(file.suffix.lower()))
+    unknown = [key for key in mapping if key not in MAP_KEYS or key == "alpha"]
+    if unknown:
+        raise InputError(f"--map {unknown[0]}=...: expected one of {', '.join(MAP_KEYS[:-1])} for a folder")
+    files = {}
+    for quantity in CHANNELS:
+        for suffix in _SUFFIXES:
+            key = quantity + suffix
+            if NOTHING in (mapping.get(key), mapping.get(quantity)):
+                continue
+            wanted = mapping.get(key, key)
+            match = next((file for file in present if wanted in (file.name, file.stem)), None)
+            if match is not None:
+                files[key] = match
+            elif key in mapping:
+                raise InputError(f"--map {key}={wanted}: not in {folder}; there are {_names(present)}")
+    if "color" not in files:
+        raise InputError(
+            f"{folder}: expected color.exr (.pfm, .hdr), found {_names(present)}; "
+            "render with output_buffers, or use --map color=FILE"
+        )
+    ignored = [file for file in present if file not in files.values()]
+    if ignored:
+        log.info("ignored: %s", _names(ignored))
+    return files
+
+
+def _files_of_scene(path: Path) -> dict[str, Path]:
+    """The files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them."""
+    try:
+        scene = json.loads(path.read_text(encoding="utf-8"))
+        renderer = scene.get("renderer", {})
+        folder = path.parent / renderer.get("output_directory", "")
+        requests = renderer.get("output_buffers", [])
+        files: dict[str, Path] = {}
+        for request in requests:
+            quantity, name = request["type"], request.get("hdr_output_file")
+            if quantity not in CHANNELS or not name:
+                log.info("ignored: output buffer %s without hdr_output_file or of unknown type", quantity)
+                continue
+            file = folder / name
+            wanted = [""]
+            wanted += ["A", "B"] if request.get("two_buffer_variance", False) else []
+            wanted += ["Variance"] if request.get("sample_variance", False) else []
+            files |= {
+                quantity + suffix: file.with_name(file.stem + suffix + file.suffix) for suffix in wanted
+            }
+        if "color" not in files and renderer.get("hdr_output_file"):
+            files["color"] = folder / renderer["hdr_output_file"]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: line {error.lineno} is not JSON ({error.msg}); mend the scene") from error
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: expected renderer.output_buffers such as "
+            '[{"type": "color", "hdr_output_file": "color.exr"}]; mend the scene'
+        ) from error
+    if "color" not in files:
+        raise InputError(
+            f'{path}: saves no colour; add {{"type": "color", "hdr_output_file": "color.exr"}} to '
+            "renderer.output_buffers and render"
+        )
+    missing = [file for file in files.values() if not file.is_file()]
+    if missing:
+        raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")
+    return files
+
+
+def _from_images(path: Path, files: Mapping[str, Path]) -> RenderBuffers:
+    """Read one file per plane; each becomes a layer named as Tungsten names its file."""
+    parts = {key: read_parts(file)[0] for key, file in files.items()}
+    color = parts["color"]
+    for key, part in parts.items():
+        if part.window != color.window:
+            raise InputError(_sizes_differ(str(files[key]), part, color))
+    channels = {
+        f"{key}.{name}": channel for key, part in parts.items() for name, channel in part.channels.items()
+    }
+    # The layers have the names that we gave them; what else a file holds is carried along under its key.
+    return _from_source(path, Source((Part(channels, color.attributes),)), color.attributes)
+
+
+def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, Any]]:
+    """Undo what write_denoised did: drop what it added, put back what it moved."""
+    first, *others = parts
+    attributes = first.attributes
+    if ADDED not in attributes:
+        return Source(parts), attributes
+    try:
+        moved = attributes[MOVED_TO] + "."
+        channels = {
+            name.removeprefix(moved): channel
+            for name, channel in first.channels.items()
+            if name not in attributes[ADDED]
+        }
+        mapping = {str(key): str(value) for key, value in json.loads(attributes[MAP]).items()}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: its attributes {OWN}* are damaged; denoise the original input again"
+        ) from error
+    restored = Part(
+        channels, {key: value for key, value in attributes.items() if not key.startswith(OWN)}, first.name
+    )
+    return Source(tuple(part for part in (restored, *others) if part.channels), mapping), attributes
+
+
+def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> RenderBuffers:
+    owner = _full_names(source.parts)
+    default = source.parts[0].name if len(source.parts) > 1 else ""
+    try:
+        found = find_layers(owner, source.mapping, default)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    groups = dict(found.channels)
+    main, _ = owner[groups["color"][0]]
+    planes: dict[str, FloatImage] = {}
+    for key, names in groups.items():
+        for part, _ in (owner[name] for name in names):
+            if part.window != main.window:
+                raise InputError(_sizes_differ(f"{path}: {key}", part, main))
+        stacked = np.stack([owner[name][1].astype(np.float32) for name in names], axis=-1)
+        planes[key] = _with_channels(stacked, _CHANNEL_COUNT.get(key, 1), f"{path}: {key}", names)
+    spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
+    if "colorVariance" not in source.mapping:
+        _settle_variance(groups, planes, spp)
+    buffers = {}
+    log.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
+    for quantity in CHANNELS:
+        known = {field: quantity + suffix for field, suffix in PLANES.items() if quantity + suffix in planes}
+        if "mean" in known:
+            buffers[quantity] = Buffer(**{field: planes[key] for field, key in known.items()})
+            log.info(
+                "%s: %s",
+                quantity,
+                "; ".join(f"{field} {', '.join(groups[key])}" for field, key in known.items()),
+            )
+    if "alpha" in planes:
+        log.info("alpha: %s", groups["alpha"][0])
+    if found.ignored:
+        log.info("ignored: %s", ", ".join(found.ignored))
+    return RenderBuffers(
+        **buffers,
+        spp=planes.get("spp", spp),
+        alpha=planes.get("alpha"),
+        attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
+        source=source,
+    )
+
+
+def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, Channel]]:
+    """Every channel by a name that is unique in the file: of several parts, each is a layer."""
+    names = {}
+    for part in parts:
+        for name, channel in part.channels.items():
+            prefix = f"{part.name}." if len(parts) > 1 else ""
+            names[name if name.startswith(prefix) else prefix + name] = (part, channel)
+    return names
+
+
+def _with_channels(image: FloatImage, count: int, label: str, names: tuple[str, ...]) -> FloatImage:
+    """Make one channel of equal ones, and three equal channels of one."""
+    given = image.shape[2]
+    if given == count:
+        return image
+    if count == 1 and all(np.array_equal(image[..., 0], image[..., k], equal_nan=True) for k in range(given)):
+        return np.ascontiguousarray(image[..., :1])
+    if count == 3 and given == 1:
+        return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+    raise InputError(f"{label}: expected {count} channels, found {', '.join(names)}; choose with --map")
+
+
+def _settle_variance(
+    groups: dict[str, tuple[str, ...]], planes: dict[str, FloatImage], spp: float | None
+) -> None:
+    """Make the variance of the mean of a layer that is merely called "Variance".
+
+    pbrt-v4 saves the variance of one sample there (``GBufferFilm::GetImage`` in its film.cpp), and the
+    number of samples as an attribute. Without that number (Arnold) the scale is unknown.
+    """
+    if not groups.get("colorVariance", ("",))[0].lower().startswith("variance."):
+        return
+    if spp:
+        planes["colorVariance"] /= np.float32(spp)
+        log.info("Variance: of one sample, divided by %g samples per pixel", spp)
+    else:
+        del planes["colorVariance"]
+        log.info("ignored: Variance, of unknown scale; if it is of the mean: --map colorVariance=Variance")
+
+
+def _sizes_differ(label: str, part: Part, color: Part) -> str:
+    got, expected = (
+        f"{width} x {height} pixels from ({column}, {row})"
+        for column, row, width, height in (part.window, color.window)
+    )
+    return f"{label}: expected {expected} as the colour has, got {got}; render all at one size"
+
+
+def _names(files: Iterable[Path]) -> str:
+    return ", ".join(file.name for file in files) or "no image"

@@ -1,0 +1,57 @@
+"""What was read, as it was: raw channels that travel untouched from the input file to the output file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy.typing as npt
+
+OWN = "tungsten_dip/"
+"""What the names of our own attributes begin with."""
+
+ADDED = OWN + "added"
+"""Attribute: the channels of the first part that write_denoised added."""
+
+MOVED_TO = OWN + "moved_to"
+"""Attribute: the layer that holds input channels whose names write_denoised took."""
+
+MAP = OWN + "map"
+"""Attribute: the --map of the input, as JSON."""
+
+SPP = OWN + "spp"
+"""Attribute: samples per pixel."""
+
+FRAME = {"dataWindow", "displayWindow", "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth"}
+"""Attributes of an EXR header that say where the pixels are; the others say where they come from."""
+
+Channel = npt.NDArray[Any]
+"""float16, float32 or uint32, shape (height, width), as in the file."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One image of a file: its channels in the order of the file, and the attributes of its (EXR) header.
+
+    The data window and the display window are among the attributes where they matter.
+    """
+
+    channels: dict[str, Channel]
+    attributes: dict[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+    @property
+    def window(self) -> tuple[int, int, int, int]:
+        """Column and row of the first pixel (the corner of the EXR data window), width and height."""
+        column, row = self.attributes.get("dataWindow", ((0, 0),))[0]
+        height, width = next(iter(self.channels.values())).shape
+        return int(column), int(row), width, height
+
+
+@dataclass(frozen=True)
+class Source:
+    """The parts of an input file, and the --map that told its layers apart."""
+
+    parts: tuple[Part, ...]
+    mapping: Mapping[str, str] = field(default_factory=dict)

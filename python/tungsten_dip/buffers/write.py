@@ -1,0 +1,175 @@
+"""Results and buffers into files.
+
+A denoised EXR holds, in one file:
+
+- R, G, B (and A) at the top level: the denoised picture, float32 or half;
+- layer ``error``: the estimated squared relative error of every pixel, where known;
+- every channel of the input bit for bit, in its own pixel type. Input channels whose names are taken move to
+  the layer ``noisy``; the parts of a multi-part input follow the part with the picture as they were;
+- attributes: those of the input, and our own, which begin with ``tungsten_dip/``.
+
+``read_buffers`` undoes this, so that a denoised file can be denoised again.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
+from tungsten_dip.buffers.layers import PLANES
+from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers
+from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
+from tungsten_dip.errors import InputError
+
+log = logging.getLogger(__name__)
+
+LARGEST_HALF = 65504.0
+
+_DENOISED_PART = "tungsten_dip denoised"
+
+_COMPONENTS = {"color": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Y", "visibility": "Y"}
+
+
+class Denoised(Protocol):
+    """What a fit gives back, as far as it is saved."""
+
+    @property
+    def color(self) -> FloatImage:
+        """Linear radiance, shape (height, width, 3)."""
+
+    @property
+    def error(self) -> FloatImage | None:
+        """Estimated squared relative error, shape (height, width, 1)."""
+
+    @property
+    def settings(self) -> Any:
+        """A dataclass with a field ``seed``."""
+
+    @property
+    def seconds(self) -> float:
+        """How long the fit took."""
+
+    @property
+    def iterations(self) -> int:
+        """How many steps the fit took."""
+
+    @property
+    def estimated_relmse(self) -> float | None:
+        """The mean of ``error``."""
+
+
+def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, half: bool = False) -> None:
+    """Write the denoised picture together with the buffers it was made from (see the top of this file).
+
+    With ``half``, the picture and the error are stored as 16 bit floats, except where that would turn a
+    value beyond 65504 into infinity. Settings, seed, seconds, iterations, the estimated relMSE and the
+    version become attributes.
+
+    Raises InputError if the file cannot be written; an existing file then stays as it was.
+    """
+    source = buffers.source or _source_from_buffers(buffers)
+    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", result.color, half))
+    if result.error is not None:
+        added |= _channels("error.", "Y", _stored("the error", result.error, half))
+    single = len(source.parts) == 1
+    kept = source.parts[0].channels if single else {}
+    if buffers.alpha is not None and "A" not in kept:
+        added["A"] = buffers.alpha[..., 0]
+    moved_to = "noisy"
+    while any(name.startswith(moved_to + ".") for name in kept):
+        moved_to += "_"
+    kept = {f"{moved_to}.{name}" if name in added else name: channel for name, channel in kept.items()}
+    own: dict[str, Any] = {
+        OWN + "version": metadata.version("tungsten-dip"),
+        OWN + "seed": str(result.settings.seed),
+        OWN + "settings": json.dumps(asdict(result.settings)),
+        OWN + "seconds": result.seconds,
+        OWN + "iterations": result.iterations,
+        ADDED: sorted(added),
+        MOVED_TO: moved_to,
+        MAP: json.dumps(dict(source.mapping)),
+    }
+    if result.estimated_relmse is not None:
+        own[OWN + "estimated_relmse"] = result.estimated_relmse
+    own |= _spp(buffers)
+    attributes = {**_frame(source), **buffers.attributes, **own}
+    if single:
+        write_exr(Path(path), [Part(added | kept, attributes, source.parts[0].name)])
+    else:
+        write_exr(Path(path), [Part(added, attributes, _DENOISED_PART), *source.parts])
+
+
+def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:
+    """Write buffers as Tungsten names them (``color.exr``, ``colorA.exr``, ...), as float32.
+
+    The folder is made if need be. The colour comes last: a set cut short cannot be mistaken for a whole one.
+
+    Raises InputError if the folder cannot be written or holds buffers that this set would not replace.
+    """
+    folder = Path(folder)
+    frame = _frame(buffers.source) if buffers.source else {}
+    files: dict[str, Part] = {}
+    for quantity, buffer in buffers.quantities():
+        names = "RGB" if CHANNELS[quantity] == 3 else "Y"
+        for field, plane in buffer.planes():
+            files[quantity + PLANES[field]] = Part(_channels("", names, plane), frame)
+    color = files.pop("color")
+    if buffers.alpha is not None:
+        color.channels["A"] = buffers.alpha[..., 0]
+    if isinstance(buffers.spp, np.ndarray):
+        color.channels["spp.Y"] = buffers.spp[..., 0]
+    files["color"] = Part(color.channels, {**frame, **buffers.attributes, **_spp(buffers)})
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stale = [
+            file.name
+            for file in folder.iterdir()
+            if file.suffix.lower() in RADIANCE_SUFFIXES
+            and file.stem in (q + suffix for q in CHANNELS for suffix in PLANES.values())
+            and not (file.suffix == ".exr" and file.stem in files)
+        ]
+    except OSError as problem:
+        raise InputError(f"{folder}: cannot be written ({problem.strerror}); choose another") from problem
+    if stale:
+        raise InputError(f"{folder}: holds {stale[0]} of another render; remove it or choose another folder")
+    for name, part in files.items():
+        write_exr(folder / f"{name}.exr", [part])
+
+
+def _source_from_buffers(buffers: RenderBuffers) -> Source:
+    """Layers for buffers that never were a file."""
+    channels: dict[str, Channel] = {}
+    for quantity, buffer in buffers.quantities():
+        for field, plane in buffer.planes():
+            channels |= _channels(f"{quantity}{PLANES[field]}.", _COMPONENTS[quantity], plane)
+    if isinstance(buffers.spp, np.ndarray):
+        channels["spp.Y"] = buffers.spp[..., 0]
+    return Source((Part(channels),))
+
+
+def _frame(source: Source) -> dict[str, Any]:
+    return {key: value for key, value in source.parts[0].attributes.items() if key in FRAME}
+
+
+def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
+    return {prefix + name: image[..., index] for index, name in enumerate(names)}
+
+
+def _stored(label: str, image: FloatImage, half: bool) -> Channel:
+    if not half:
+        return image
+    if np.any(np.isfinite(image) & (np.abs(image) > LARGEST_HALF)):
+        log.warning("%s has values beyond %g, the largest half float: stored as float32", label, LARGEST_HALF)
+        return image
+    return image.astype(np.float16)
+
+
+def _spp(buffers: RenderBuffers) -> dict[str, float]:
+    return {SPP: float(buffers.spp)} if isinstance(buffers.spp, (int, float)) else {}
