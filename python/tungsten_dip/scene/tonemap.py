@@ -1,0 +1,60 @@
+"""Tungsten's five tonemaps: what its PNG files show of linear radiance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import get_args
+
+import numpy as np
+
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.errors import InputError
+from tungsten_dip.scene.types import TonemapName
+
+# Every curve is flat up here; beyond it the squares in the filmic one would overflow.
+_SATURATED = np.float32(1e6)
+
+
+def display_from_radiance(radiance: FloatImage, tonemap: str) -> FloatImage:
+    """Return display values in [0, 1] of linear radiance, any shape; NaN and negative radiance become black.
+
+    Raises InputError if Tungsten has no such tonemap.
+    """
+    if tonemap not in _CURVES:
+        raise InputError(
+            f"tonemap: expected one of {', '.join(get_args(TonemapName))}, got {tonemap}; choose one"
+        )
+    light = np.clip(np.nan_to_num(radiance, nan=0.0), 0.0, _SATURATED)
+    return np.clip(_CURVES[tonemap](light), 0.0, 1.0).astype(np.float32)
+
+
+def _linear(light: FloatImage) -> FloatImage:
+    return light
+
+
+def _gamma(light: FloatImage) -> FloatImage:
+    return np.power(light, 1.0 / 2.2)
+
+
+def _reinhard(light: FloatImage) -> FloatImage:
+    return np.power(light / (light + 1.0), 1.0 / 2.2)
+
+
+def _filmic(light: FloatImage) -> FloatImage:
+    """Hejl and Burgess-Dawson's fit of film, "Filmic tonemapping for real-time rendering" (SIGGRAPH 2010)."""
+    x = np.maximum(light - 0.004, 0.0)
+    return np.asarray(x * (6.2 * x + 0.5) / (x * (6.2 * x + 1.7) + 0.06))
+
+
+def _pbrt(light: FloatImage) -> FloatImage:
+    """The transfer function of sRGB (IEC 61966-2-1), which pbrt writes its images with."""
+    return np.where(light < 0.0031308, 12.92 * light, 1.055 * np.power(light, 1.0 / 2.4) - 0.055)
+
+
+_CURVES: dict[str, Callable[[FloatImage], FloatImage]] = {
+    "linear": _linear,
+    "gamma": _gamma,
+    "reinhard": _reinhard,
+    "filmic": _filmic,
+    "pbrt": _pbrt,
+}
