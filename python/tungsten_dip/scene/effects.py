@@ -1,0 +1,329 @@
+"""Which effects a scene calls for, and what follows from it.
+
+Nothing else is simulated, written or learned from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+from tungsten_dip.scene.types import (
+    AtmosphericMedium,
+    Bsdf,
+    BufferName,
+    CheckerTexture,
+    ConductorBsdf,
+    ConstantTexture,
+    Curves,
+    DielectricBsdf,
+    DiffuseTransmissionBsdf,
+    ExponentialMedium,
+    ForwardBsdf,
+    HomogeneousMedium,
+    InfiniteSphere,
+    InfiniteSphereCap,
+    Instances,
+    Medium,
+    Mesh,
+    MinecraftMap,
+    MirrorBsdf,
+    PathTracer,
+    PhongBsdf,
+    PlasticBsdf,
+    Point,
+    Primitive,
+    RoughCoatBsdf,
+    RoughConductorBsdf,
+    RoughDielectricBsdf,
+    RoughPlasticBsdf,
+    RoughWireBsdf,
+    Scene,
+    Skydome,
+    SmoothCoatBsdf,
+    Texture,
+    ThinlensCamera,
+    ThinSheetBsdf,
+    TransparencyBsdf,
+    Vec3,
+)
+
+_GLOSSY = (
+    PhongBsdf,
+    RoughCoatBsdf,
+    RoughConductorBsdf,
+    RoughDielectricBsdf,
+    RoughPlasticBsdf,
+    RoughWireBsdf,
+)
+_SPECULAR = (ConductorBsdf, DielectricBsdf, MirrorBsdf, PlasticBsdf, SmoothCoatBsdf, ThinSheetBsdf)
+_ALWAYS_SPECULAR = (ConductorBsdf, DielectricBsdf, ForwardBsdf, MirrorBsdf, ThinSheetBsdf)
+_ENVIRONMENT = (InfiniteSphere, InfiniteSphereCap, Skydome)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """The effects that a scene calls for. Every field lists the objects that call for it; empty: nothing
+    does.
+
+    Only what is in use counts: BSDFs on primitives, media that fill something and are not empty, lights that
+    shine.
+    """
+
+    depth_of_field: tuple[str, ...]
+    glossy_reflection: tuple[str, ...]
+    specular_transport: tuple[str, ...]
+    transmission: tuple[str, ...]
+    transparency: tuple[str, ...]
+    participating_media: tuple[str, ...]
+    hair: tuple[str, ...]
+    textures: tuple[str, ...]
+    environment_light: tuple[str, ...]
+    max_bounces: int
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is simulated, written and learned from.
+
+    ``integrator`` is ``volpath`` with participating media alone. ``buffers`` are asked of the renderer;
+    ``features`` are those of them that will carry information. ``reasons`` says why, by the name of what was
+    decided.
+    """
+
+    integrator: Literal["path", "volpath"]
+    lens_samples: bool
+    environment_samples: bool
+    max_bounces: int
+    buffers: tuple[BufferName, ...]
+    features: tuple[BufferName, ...]
+    reasons: dict[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the decision as plain objects for JSON."""
+        return asdict(self)
+
+
+def effects_of(scene: Scene) -> Effects:
+    """Return the effects that a scene calls for."""
+    primitives = list(_primitives(scene))
+    bsdfs = list(_bsdfs(primitives))
+    media = [
+        m for primitive in primitives for m in (primitive.int_medium, primitive.ext_medium) if m is not None
+    ]
+    if scene.camera.medium is not None:
+        media.append(scene.camera.medium)
+    textured: list[Bsdf | Primitive] = [
+        *bsdfs,
+        *(primitive for primitive in primitives if _shines(primitive)),
+    ]
+    aperture = scene.camera.aperture_size if isinstance(scene.camera, ThinlensCamera) else 0.0
+    return Effects(
+        depth_of_field=(f"camera (aperture {aperture:g})",) if aperture > 0.0 else (),
+        glossy_reflection=_names(b for b in bsdfs if isinstance(b, _GLOSSY)),
+        specular_transport=_names(b for b in bsdfs if isinstance(b, _SPECULAR)),
+        transmission=_names(b for b in bsdfs if _transmits(b)),
+        transparency=_names(b for b in bsdfs if _is_crossed_unbent(b)),
+        participating_media=_names(m for m in media if not _is_empty(m)),
+        hair=_names(p for p in primitives if isinstance(p, Curves)),
+        textures=_names(o for o in textured if any(_varies(t) for t in _textures(o))),
+        environment_light=_names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _shines(p)),
+        max_bounces=scene.integrator.max_bounces,
+    )
+
+
+def decision_of(scene: Scene) -> Decision:
+    """Return what a scene's effects mean for its rendering and its denoising."""
+    effects = effects_of(scene)
+    reasons = {
+        "integrator": "paths through volumes" if effects.participating_media else "no participating media",
+        "lens_samples": "depth of field" if effects.depth_of_field else "everything is in focus",
+        "environment_samples": (
+            "light from outside" if effects.environment_light else "no light comes from outside the scene"
+        ),
+        "color": "the image itself",
+        **_reasons_without_information(scene, effects),
+    }
+    if not isinstance(scene.integrator, PathTracer):
+        reasons["integrator"] += f"; in place of {scene.integrator.kind}, which writes no feature buffers"
+    features: list[BufferName] = []
+    informative: dict[BufferName, str] = {
+        "albedo": "tells surfaces of different colours apart",
+        "normal": "tells surfaces of different orientation apart",
+        "depth": "tells near from far",
+    }
+    for name, reason in informative.items():
+        if name not in reasons:
+            features.append(name)
+            reasons[name] = reason
+    return Decision(
+        integrator="volpath" if effects.participating_media else "path",
+        lens_samples=bool(effects.depth_of_field),
+        environment_samples=bool(effects.environment_light),
+        max_bounces=effects.max_bounces,
+        buffers=("color", *features),
+        features=tuple(features),
+        reasons=reasons,
+    )
+
+
+def inspect_facts(scene: Scene) -> dict[str, Any]:
+    """Return what `inspect_text` says as plain objects for JSON."""
+    return {
+        "scene": str(scene.path),
+        "width": scene.camera.resolution[0],
+        "height": scene.camera.resolution[1],
+        "spp": scene.renderer.spp,
+        "camera": scene.camera.kind,
+        "tonemap": scene.camera.tonemap,
+        "integrator": scene.integrator.kind,
+        "primitives": len(scene.primitives),
+        "effects": asdict(effects_of(scene)),
+        "decision": decision_of(scene).to_json(),
+    }
+
+
+def inspect_text(scene: Scene) -> str:
+    """Return the effects that a scene calls for and what follows from them, as a table for people."""
+    effects, decision = effects_of(scene), decision_of(scene)
+    width, height = scene.camera.resolution
+    lines = [
+        f"{scene.path}: {width} x {height} pixels, {scene.renderer.spp} samples per pixel, "
+        f"{len(scene.primitives)} primitives",
+        "",
+        "effect               called for by",
+    ]
+    for field in fields(effects):
+        value = getattr(effects, field.name)
+        text = str(value) if isinstance(value, int) else _listed(value)
+        lines.append(f"{field.name.replace('_', ' '):<21}{text}")
+
+    def row(name: str, value: str, reason: str) -> str:
+        return f"{name:<21}{value:<16}{reason}".rstrip()
+
+    lines += [
+        "",
+        row("what follows", "", "why"),
+        row("integrator", decision.integrator, decision.reasons["integrator"]),
+    ]
+    for name in ("lens_samples", "environment_samples"):
+        lines.append(
+            row(name.replace("_", " "), "yes" if getattr(decision, name) else "no", decision.reasons[name])
+        )
+    lines.append(row("buffers asked for", ", ".join(decision.buffers), ""))
+    for name in ("albedo", "normal", "depth", "visibility"):
+        lines.append(
+            row(
+                f"  {name}",
+                "learned from" if name in decision.features else "left out",
+                decision.reasons[name],
+            )
+        )
+    return "\n".join(lines)
+
+
+def _reasons_without_information(scene: Scene, effects: Effects) -> dict[str, str]:
+    """Return the features that would be constant, or as noisy as the image, with the reason."""
+    reasons = {"visibility": "one random shadow ray a sample: as noisy as the image that it would guide"}
+    surfaces = [p for p in _primitives(scene) if not isinstance(p, (*_ENVIRONMENT, Point, Instances))]
+    if not surfaces:
+        reasons |= dict.fromkeys(("normal", "depth"), "nothing but environment is in the scene")
+        if not effects.environment_light:
+            reasons["albedo"] = "nothing is in the scene"
+        return reasons
+    if effects.environment_light or any(_shines(surface) for surface in surfaces):
+        # Emitters add their radiance to the albedo, and the sky is written as one.
+        return reasons
+    if any(isinstance(surface, MinecraftMap) for surface in surfaces):
+        return reasons
+    albedos = {_constant_value(albedo) for surface in surfaces for albedo in _written_albedos(surface)}
+    if len(albedos) <= 1 and None not in albedos:
+        reasons["albedo"] = "one colour on every surface"
+    return reasons
+
+
+def _written_albedos(surface: Primitive) -> Iterator[Texture]:
+    """Yield what Tungsten writes as albedo: that of the outermost BSDF, but it looks through transparency."""
+    bsdfs = surface.bsdf if isinstance(surface, Mesh) else (getattr(surface, "bsdf", None),)
+    for bsdf in bsdfs:
+        if isinstance(bsdf, TransparencyBsdf):
+            yield bsdf.base.albedo
+        elif isinstance(bsdf, Bsdf) and not isinstance(bsdf, _ALWAYS_SPECULAR):
+            yield bsdf.albedo
+
+
+def _primitives(scene: Scene) -> Iterator[Primitive]:
+    """Yield every primitive, and the masters of instances that are placed somewhere."""
+    waiting = list(reversed(scene.primitives))
+    while waiting:
+        primitive = waiting.pop()
+        yield primitive
+        if isinstance(primitive, Instances):
+            waiting.extend(reversed(primitive.masters))
+
+
+def _bsdfs(primitives: list[Primitive]) -> Iterator[Bsdf]:
+    """Yield every BSDF on a primitive and every one within it, each once."""
+    waiting: list[Any] = [getattr(primitive, "bsdf", ()) for primitive in reversed(primitives)]
+    seen = set()
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, tuple):
+            waiting.extend(reversed(item))
+        elif item not in seen:
+            seen.add(item)
+            yield item
+            waiting.extend(value for value in vars(item).values() if isinstance(value, Bsdf))
+
+
+def _textures(item: Bsdf | Primitive) -> Iterator[Texture]:
+    yield from (value for value in vars(item).values() if isinstance(value, Texture))
+
+
+def _constant_value(texture: Texture) -> Vec3 | None:
+    """Return the one value of a texture, or None if it varies."""
+    if isinstance(texture, ConstantTexture):
+        return texture.value
+    if isinstance(texture, CheckerTexture) and texture.on_color == texture.off_color:
+        return texture.on_color
+    return None
+
+
+def _varies(texture: Texture) -> bool:
+    return _constant_value(texture) is None
+
+
+def _shines(primitive: Primitive) -> bool:
+    if isinstance(primitive, Skydome):
+        return primitive.intensity > 0.0
+    return primitive.emitter is not None and _constant_value(primitive.emitter) != (0.0, 0.0, 0.0)
+
+
+def _is_empty(medium: Medium) -> bool:
+    """Whether a medium neither scatters nor absorbs."""
+    if not isinstance(medium, HomogeneousMedium | AtmosphericMedium | ExponentialMedium):
+        return False
+    return medium.density == 0.0 or not any((*medium.sigma_a, *medium.sigma_s))
+
+
+def _transmits(bsdf: Bsdf) -> bool:
+    if isinstance(bsdf, DielectricBsdf | RoughDielectricBsdf):
+        return bsdf.enable_refraction
+    return isinstance(bsdf, DiffuseTransmissionBsdf)
+
+
+def _is_crossed_unbent(bsdf: Bsdf) -> bool:
+    if isinstance(bsdf, TransparencyBsdf):
+        return _constant_value(bsdf.alpha) != (1.0, 1.0, 1.0)
+    return isinstance(bsdf, ForwardBsdf | ThinSheetBsdf)
+
+
+def _names(items: Iterator[Any]) -> tuple[str, ...]:
+    """Return what to call objects in messages: their name in the file or else their type, each once."""
+    return tuple(dict.fromkeys(f"{item.name} ({item.kind})" if item.name else item.kind for item in items))
+
+
+def _listed(names: tuple[str, ...], most: int = 4) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more if names else "-"
