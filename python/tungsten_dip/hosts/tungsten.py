@@ -1,0 +1,371 @@
+"""Tungsten itself as the host: renders a scene in this process and hands over its camera's buffers.
+
+The package must have been built against a Tungsten (docs/tungsten.md). Where Tungsten's libraries cannot
+be linked into a Python module, `render` goes through the native command, which has the hook linked in.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.progress import Progress, silent
+
+_log = logging.getLogger(__name__)
+
+BUILD_HINT = "build the package with Tungsten_ROOT set to a Tungsten checkout (docs/tungsten.md)"
+
+Evidence = Mapping[str, Any]
+"""What the hook hands over: {quantity: {mean, half_a, half_b, variance}, "spp": a number or an array}."""
+
+
+@dataclass(frozen=True)
+class DriverOptions:
+    """The stock command's flags. None: as the scene file has it.
+
+    File names and folders are relative to the working directory, `output_file` and `hdr_output_file` to
+    `output_directory` where that is given. `restart` ignores a saved state that could be resumed.
+    """
+
+    threads: int | None = None
+    spp: int | None = None
+    seed: int | None = None
+    restart: bool = False
+    checkpoint_interval_s: float | None = None
+    timeout_s: float | None = None
+    input_directory: Path | None = None
+    output_directory: Path | None = None
+    output_file: Path | None = None
+    hdr_output_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("threads", "spp"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name}: expected a number above 0, got {value}")
+        if self.seed is not None and not 0 <= self.seed < 2**32:
+            raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {self.seed}")
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A render, finished or at a checkpoint, and the files (absolute) that Tungsten writes of it."""
+
+    buffers: RenderBuffers
+    output_file: Path | None
+    hdr_output_file: Path | None
+    tonemap: str
+
+
+def available() -> bool:
+    """Return whether this package was built against a Tungsten."""
+    return _module() is not None or executable() is not None
+
+
+def in_process() -> bool:
+    """Return whether Tungsten can render in this process; otherwise `run_native` can do everything."""
+    return _module() is not None
+
+
+def executable() -> Path | None:
+    """Return the native ``tungsten`` command that was built with this package, or None."""
+    path = Path(__file__).parents[1] / "bin" / "tungsten"
+    return path if os.access(path, os.X_OK) else None
+
+
+def run_native(arguments: Sequence[str]) -> NoReturn:
+    """Replace this process by the native command; without ``--dip-`` flags that is stock Tungsten.
+
+    Raises InputError if the package was built without a Tungsten.
+    """
+    command = _require_executable()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(command, ["tungsten", *arguments], _environment())
+
+
+def render(
+    scene_path: str | Path,
+    spp: int | None = None,
+    seed: int | None = None,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> RenderBuffers:
+    """Render a scene and return its buffers; writes no file.
+
+    None takes the scene's ``spp``, the stock command's seed and all cores but one. The sampler is the
+    independent one whatever the scene says: with Tungsten's default the halves A and B would not be
+    independent.
+
+    Raises InputError if Tungsten cannot load or render the scene, or is not there.
+    """
+    options = DriverOptions(spp=spp, seed=seed, threads=threads)
+    if _module() is None:
+        return _render_in_child(Path(scene_path), options, progress)
+    session = _load(Path(scene_path), options)
+    if _render_passes(session, Path(scene_path), options, None, progress):
+        raise KeyboardInterrupt
+    return _buffers(session.plan, session.take_evidence())
+
+
+def drive(
+    scene_path: str | Path,
+    options: DriverOptions | None = None,
+    on_checkpoint: Callable[[Rendered], None] | None = None,
+    progress: Progress = silent,
+) -> Rendered:
+    """Render a scene as the stock command does, its files included, and return its buffers.
+
+    As the stock command: checkpoints, a timeout that ends the render at the next pass, resuming. The
+    differences: the sampler is independent, every buffer that guides a fit is rendered, and the state
+    that can be resumed is kept in a file of its own (``_dip`` added to its name), since other buffers are
+    in it. ``on_checkpoint`` is given a copy of what is known at each checkpoint; if it fails, the render
+    goes on without it and the error is raised at the end.
+
+    Whatever happens, the render's own files are written before this returns or raises. The first Ctrl-C
+    ends the render after the pass in hand (KeyboardInterrupt), a second one ends the process.
+
+    Raises InputError if Tungsten cannot load or render the scene, or is not there.
+    """
+    options = options or DriverOptions()
+    session = _load(Path(scene_path), options)
+    plan = session.plan
+
+    def rendered(evidence: Evidence) -> Rendered:
+        output_file = Path(plan.output_file) if plan.output_file else None
+        hdr_output_file = Path(plan.hdr_output_file) if plan.hdr_output_file else None
+        return Rendered(_buffers(plan, evidence), output_file, hdr_output_file, plan.tonemap)
+
+    failure: Exception | None = None
+
+    def checkpoint() -> None:
+        nonlocal failure
+        session.save_checkpoint()
+        if on_checkpoint is not None and failure is None:
+            try:
+                on_checkpoint(rendered(session.evidence()))
+            except Exception as error:
+                failure = error
+                _log.warning("the preview failed, the render goes on without: %s", error)
+
+    try:
+        interrupted = _render_passes(session, Path(scene_path), options, checkpoint, progress)
+    finally:
+        session.save_outputs()
+    if interrupted:
+        raise KeyboardInterrupt
+    if failure is not None:
+        raise failure
+    return rendered(session.take_evidence())
+
+
+def render_to_folder(arguments: Sequence[str]) -> int:
+    """Serve `render` inside the native command: render, and leave the evidence in a folder.
+
+    The arguments are the command's private flag, the folder, a file descriptor for progress, the scene and
+    the options as JSON. Returns the exit status.
+    """
+    _, folder, descriptor, scene, options = arguments
+    with os.fdopen(int(descriptor), "w", buffering=1) as pipe:
+
+        def progress(fraction: float, message: str) -> None:
+            pipe.write(f"{fraction} {message}\n")
+
+        try:
+            buffers = render(scene, **json.loads(options), progress=progress)
+        except InputError as error:
+            Path(folder, "error").write_text(str(error))
+            return 2
+    arrays: dict[str, Any] = {
+        f"{name}.{plane}": array for name, buffer in buffers.quantities() for plane, array in buffer.planes()
+    }
+    np.savez(Path(folder, "evidence.npz"), spp=np.asarray(buffers.spp), **arrays)
+    Path(folder, "attributes").write_text(json.dumps(buffers.attributes))
+    return 0
+
+
+def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) -> RenderBuffers:
+    command = _require_executable()
+    given = {name: value for name, value in asdict(options).items() if name in ("spp", "seed", "threads")}
+    read_end, write_end = os.pipe()
+    with tempfile.TemporaryDirectory() as folder, os.fdopen(read_end) as lines:
+        child = subprocess.Popen(
+            [command, "--dip-render-buffers", folder, str(write_end), str(scene), json.dumps(given)],
+            env=_environment(),
+            pass_fds=[write_end],
+        )
+        os.close(write_end)
+        for line in lines:
+            fraction, _, message = line.rstrip("\n").partition(" ")
+            progress(float(fraction), message)
+        status = child.wait()
+        if status:
+            error = Path(folder, "error")
+            raise InputError(
+                error.read_text() if error.exists() else f"{scene}: Tungsten ended with status {status}"
+            )
+        with np.load(Path(folder, "evidence.npz")) as arrays:
+            buffers: dict[str, Any] = {
+                name: Buffer(**{plane: arrays[f"{name}.{plane}"] for plane in _planes(arrays.files, name)})
+                for name in CHANNELS
+                if f"{name}.mean" in arrays.files
+            }
+            spp = arrays["spp"]
+        attributes = json.loads(Path(folder, "attributes").read_text())
+    return RenderBuffers(**buffers, spp=spp if spp.ndim else float(spp), attributes=attributes)
+
+
+def _planes(files: Sequence[str], name: str) -> list[str]:
+    return [file.removeprefix(f"{name}.") for file in files if file.startswith(f"{name}.")]
+
+
+def _load(scene: Path, options: DriverOptions) -> Any:
+    module = _require_module()
+    if not scene.is_file():
+        raise InputError(f"{scene}: expected a scene file, found none; check the path")
+    names = ("input_directory", "output_directory", "output_file", "hdr_output_file")
+    paths = {name: str(getattr(options, name) or "") for name in names}
+    try:
+        return module.Render(
+            str(scene), threads=options.threads or 0, spp=options.spp, seed=options.seed, **paths
+        )
+    except RuntimeError as error:
+        raise InputError(f"{scene}: Tungsten cannot load it: {error}") from None
+
+
+def _render_passes(
+    session: Any,
+    scene: Path,
+    options: DriverOptions,
+    checkpoint: Callable[[], None] | None,
+    progress: Progress,
+) -> bool:
+    """Render until done or out of time; return whether Ctrl-C ended it early."""
+    plan = session.plan
+    if not plan.writes_features:
+        _log.info("%s: the integrator %s writes no feature buffers: colour alone", scene, plan.integrator)
+    if checkpoint is not None and plan.resume and not options.restart:
+        _resume(session)
+    interval_s = options.checkpoint_interval_s
+    interval_s = plan.checkpoint_interval_s if interval_s is None else interval_s
+    timeout_s = plan.timeout_s if options.timeout_s is None else options.timeout_s
+
+    start = last_checkpoint = time.monotonic()
+    total = max(session.total_spp, 1)
+    while not session.done:
+        progress(session.current_spp / total, f"{session.current_spp}/{total} spp")
+        with _deferred_interrupt() as interrupt_requested:
+            try:
+                session.render_pass()
+            except RuntimeError as error:
+                raise InputError(f"{scene}: Tungsten cannot render it: {error}") from None
+        if interrupt_requested():
+            return True
+        now = time.monotonic()
+        if timeout_s > 0 and now - start > timeout_s:
+            _log.info("%s: out of time after %d of %d spp", scene, session.current_spp, total)
+            break
+        if checkpoint is not None and interval_s > 0 and now - last_checkpoint > interval_s:
+            checkpoint()
+            last_checkpoint = time.monotonic()
+    progress(1.0, f"{session.current_spp}/{total} spp")
+    return False
+
+
+def _resume(session: Any) -> None:
+    try:
+        resumed = session.resume()
+    except RuntimeError as error:
+        _log.warning("the saved state cannot be read: %s", error)
+        resumed = False
+    if resumed:
+        _log.info("resuming at %d spp", session.current_spp)
+    else:
+        _log.info("no saved state of this scene with evidence: starting at 0 spp")
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Turn a first Ctrl-C into a request that can be asked for; a second one ends the process.
+
+    Only the main thread can handle signals; elsewhere nothing changes.
+    """
+    requested = False
+
+    def request(_signal: int, _frame: object) -> None:
+        nonlocal requested
+        requested = True
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        _log.warning("stopping after this pass; Ctrl-C again stops at once and saves nothing")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    previous = signal.signal(signal.SIGINT, request)
+    try:
+        yield lambda: requested
+    finally:
+        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
+
+
+def _buffers(plan: Any, evidence: Evidence) -> RenderBuffers:
+    spp = evidence["spp"]
+    planes = {name: dict(evidence[name]) for name in CHANNELS if name in evidence}
+    if np.max(spp) < 2 and plan.writes_features:
+        # The second half is empty and the variance is zero: neither says anything.
+        _log.warning("1 sample per pixel has no halves and no variance; render at least 2")
+        planes = {name: {"mean": known["mean"]} for name, known in planes.items()}
+    attributes = {
+        "renderer": f"Tungsten {_require_module().tungsten_version}",
+        "integrator": plan.integrator,
+        "seed": plan.seed,
+    }
+    buffers: dict[str, Any] = {name: Buffer(**known) for name, known in planes.items()}
+    return RenderBuffers(**buffers, spp=spp, attributes=attributes)
+
+
+def _module() -> Any | None:
+    """The hook: linked into the native command, or importable, or neither."""
+    try:
+        return importlib.import_module("tungsten_dip._tungsten")
+    except ModuleNotFoundError:
+        return None
+    except ImportError as error:
+        _log.warning("the hook for Tungsten cannot be loaded: %s", error)
+        return None
+
+
+def _require_module() -> Any:
+    module = _module()
+    if module is None:
+        raise InputError(f"Tungsten cannot render in this process; {BUILD_HINT}")
+    return module
+
+
+def _require_executable() -> Path:
+    command = executable()
+    if command is None:
+        raise InputError(f"Tungsten is not there; {BUILD_HINT}")
+    return command
+
+
+def _environment() -> dict[str, str]:
+    """The native command's Python is this one."""
+    return {**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable}
