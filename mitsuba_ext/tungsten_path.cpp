@@ -1,0 +1,629 @@
+// The integrator "tungsten_path": radiance and feature buffers with the meaning that Tungsten's path tracer
+// gives them, from the same camera rays. Variant scalar_rgb only.
+//
+// | parameter                    | type    | meaning |
+// |------------------------------|---------|---------------------------------------------------------------------|
+// | quantities                   | string  | what to record, of color albedo normal depth visibility (all) |
+// | min_bounces, max_bounces     | integer | light is counted on paths of min_bounces to max_bounces - 1
+// bounces,| |                              |         | crossings of transparent surfaces included (0, 64) |
+// | enable_light_sampling        | boolean | sample emitters from surfaces (true) | |
+// enable_volume_light_sampling | boolean | sample emitters from media (true) | | enable_consistency_checks |
+// boolean | drop directions on which shading and geometry disagree (false)      | | low_order_scattering |
+// boolean | light that a medium scattered once counts (true)                    | | include_surfaces |
+// boolean | light that no medium scattered counts (true)                        | | reconstruction_filter |
+// string  | Tungsten's name of the filter that distributes the samples ("tent") | | pixel_center | float   |
+// where in the pixel the filter is centred (0.5)                      | | threads                      |
+// integer | threads, the calling one included (1)                               | | albedo_<id> | texture |
+// the albedo of the BSDF of that id; every BSDF that is seen needs one|
+//
+// render() returns a tensor of shape (height, width, channels): for every quantity, in the order of
+// `quantities`, its mean, the mean of its even samples (half A), of its odd ones (half B), and the variance
+// of the mean, each with the channels of the quantity. The parameter "progress" is the fraction done and may
+// be read meanwhile.
+//
+// The result depends on the seed alone, not on the number of threads: every pixel has a random stream of its
+// own.
+
+#include <drjit/random.h>
+#include <mitsuba/core/properties.h>
+#include <mitsuba/core/random.h>
+#include <mitsuba/render/bsdf.h>
+#include <mitsuba/render/emitter.h>
+#include <mitsuba/render/film.h>
+#include <mitsuba/render/integrator.h>
+#include <mitsuba/render/medium.h>
+#include <mitsuba/render/phase.h>
+#include <mitsuba/render/scene.h>
+#include <mitsuba/render/sensor.h>
+#include <mitsuba/render/shape.h>
+#include <mitsuba/render/texture.h>
+#include <nanothread/nanothread.h>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <map>
+#include <memory>
+#include <numbers>
+#include <optional>
+#include <sstream>
+#include <string>
+#include <string_view>
+#include <vector>
+
+namespace mitsuba {
+namespace {
+
+using Variant = RenderAliases<float, Color<float, 3>>;
+using Rgb = Color<float, 3>;
+using Vector2 = Vector<float, 2>;
+using Vector3 = Vector<float, 3>;
+using Point2 = Point<float, 2>;
+using Point3 = Point<float, 3>;
+using Ray3 = Variant::Ray3f;
+using SurfaceHit = Variant::SurfaceInteraction3f;
+using MediumHit = Variant::MediumInteraction3f;
+using Vertex = Variant::Interaction3f;
+
+// Mitsuba's types are laid out for the instruction set that the wheel was compiled for.
+#if defined(__x86_64__)
+static_assert(sizeof(Point3) == 16, "compile for x86-64-v3, as Mitsuba's wheel is");
+#endif
+
+constexpr uint32_t tile_size = 16;
+
+class Random {
+  public:
+    Random(uint32_t seed, uint32_t pixel) : generator_(1, sample_tea_64(seed, pixel), pixel) {}
+
+    float next() { return generator_.next_float32(); }
+    Point2 next_2d() {
+        const float x = next();
+        return {x, next()};
+    }
+
+  private:
+    dr::PCG32<uint32_t> generator_;
+};
+
+// Distributes samples by Tungsten's tabulated reconstruction filter: 31 bins per half, each as likely as the
+// filter is high at the lower end of the bin *before* it. Negative lobes are lost: the sum of the bins passes
+// 1 before it falls back to 1, and a sample takes the first bin at which the sum exceeds its number.
+class FilterTable {
+  public:
+    explicit FilterTable(std::string_view name) {
+        if (name == "box" || name == "dirac") {
+            box_width_ = name == "box" ? 1.f : 0.f;
+            return;
+        }
+        const auto [function, width] = find(name);
+        bin_width_ = width / bin_count;
+        std::array<float, bin_count> heights{};
+        float sum = 0.f;
+        for (size_t i = 0; i < bin_count; ++i) {
+            heights[i] = function(static_cast<float>(i) * width / bin_count);
+            sum += heights[i];
+        }
+        for (size_t i = 1; i < bin_count; ++i) sums_[i] = sums_[i - 1] + heights[i - 1] / sum;
+    }
+
+    // The offset from the centre of the pixel, in pixels.
+    [[nodiscard]] Vector2 sample(Point2 uniform) const {
+        if (bin_width_ == 0.f) return {(uniform.x() - 0.5f) * box_width_, (uniform.y() - 0.5f) * box_width_};
+        return {sample(uniform.x()), sample(uniform.y())};
+    }
+
+  private:
+    using Function = float (*)(float);
+    static constexpr size_t bin_count = 31;
+
+    [[nodiscard]] float sample(float uniform) const {
+        const float sign = uniform < 0.5f ? -1.f : 1.f;
+        const float target = 2.f * (uniform < 0.5f ? uniform : uniform - 0.5f);
+        size_t bin = 1;
+        while (bin < bin_count - 1 && target >= sums_[bin]) ++bin;
+        const float within = (target - sums_[bin - 1]) / (sums_[bin] - sums_[bin - 1]);
+        return sign * bin_width_ * (static_cast<float>(bin) + within);
+    }
+
+    // The filter at a distance of x >= 0 pixels, and its radius.
+    static std::pair<Function, float> find(std::string_view name) {
+        if (name == "tent") return {[](float x) { return 1.f - x; }, 1.f};
+        if (name == "gaussian")
+            return {[](float x) { return std::max(std::exp(-2.f * x * x) - std::exp(-8.f), 0.f); }, 2.f};
+        if (name == "mitchell_netravali")
+            return {[](float x) { return cubic(x, 1.f / 3.f, 1.f / 3.f); }, 2.f};
+        if (name == "catmull_rom") return {[](float x) { return cubic(x, 0.f, 0.5f); }, 2.f};
+        if (name == "lanczos")
+            return {[](float x) {
+                        constexpr float pi = std::numbers::pi_v<float>;
+                        return x == 0.f ? 1.f
+                                        : 2.f * std::sin(pi * x) * std::sin(pi * x / 2.f) / (pi * pi * x * x);
+                    },
+                    2.f};
+        Throw("reconstruction_filter: unknown filter \"%s\"", name);
+    }
+
+    // Mitchell and Netravali, "Reconstruction Filters in Computer Graphics", SIGGRAPH 1988, equation 8.
+    static float cubic(float x, float b, float c) {
+        if (x < 1.f)
+            return ((12.f - 9.f * b - 6.f * c) * x * x * x + (-18.f + 12.f * b + 6.f * c) * x * x + 6.f -
+                    2.f * b) /
+                   6.f;
+        return ((-b - 6.f * c) * x * x * x + (6.f * b + 30.f * c) * x * x + (-12.f * b - 48.f * c) * x +
+                8.f * b + 24.f * c) /
+               6.f;
+    }
+
+    float box_width_ = 0.f;
+    float bin_width_ = 0.f;
+    std::array<float, bin_count> sums_{};
+};
+
+enum Quantity : uint8_t { color, albedo, normal, depth, visibility };
+constexpr std::array<std::string_view, 5> quantity_names{"color", "albedo", "normal", "depth", "visibility"};
+constexpr size_t quantity_count = quantity_names.size();
+
+constexpr size_t channel_count(Quantity quantity) {
+    return quantity == depth || quantity == visibility ? 1 : 3;
+}
+
+// What one camera ray tells: a quantity that it says nothing of stays empty and is not averaged.
+class Sample {
+  public:
+    void set(Quantity quantity, const Vector3& value) {
+        values_[quantity] = {value.x(), value.y(), value.z()};
+    }
+    void set(Quantity quantity, const Rgb& value) { values_[quantity] = {value.r(), value.g(), value.b()}; }
+    void set(Quantity quantity, float value) { values_[quantity] = {value, value, value}; }
+    [[nodiscard]] const std::optional<std::array<float, 3>>& get(Quantity quantity) const {
+        return values_[quantity];
+    }
+
+  private:
+    std::array<std::optional<std::array<float, 3>>, quantity_count> values_;
+};
+
+// The statistics of one quantity of one pixel. Samples that are not finite are left out.
+class Accumulator {
+  public:
+    void add(const std::array<float, 3>& sample) {
+        if (!std::all_of(sample.begin(), sample.end(), [](float x) { return std::isfinite(x); })) return;
+        const size_t half = count_ & 1U;
+        ++count_;
+        for (size_t c = 0; c < 3; ++c) {
+            const double value = sample[c];
+            half_sums_[half][c] += value;
+            const double delta = value - means_[c];  // Welford, Technometrics 4 (1962)
+            means_[c] += delta / count_;
+            squared_deviations_[c] += delta * (value - means_[c]);
+        }
+    }
+
+    void store(size_t channels, float* out) const {
+        const double count_a = std::max((count_ + 1) / 2, 1U);
+        const double count_b = std::max(count_ / 2, 1U);
+        for (size_t c = 0; c < channels; ++c) {
+            out[c] = static_cast<float>(half_sums_[0][c] / count_a);
+            out[channels + c] = static_cast<float>(half_sums_[1][c] / count_b);
+            out[2 * channels + c] = static_cast<float>(squared_deviations_[c]);
+        }
+        out[3 * channels] = static_cast<float>(count_);
+    }
+
+  private:
+    uint32_t count_ = 0;
+    std::array<std::array<double, 3>, 2> half_sums_{};
+    std::array<double, 3> means_{};
+    std::array<double, 3> squared_deviations_{};
+};
+
+float power_heuristic(float pdf, float other) {
+    const float squared = pdf * pdf;
+    return squared > 0.f ? squared / (squared + other * other) : 0.f;
+}
+
+bool is_black(const Rgb& value) { return !(dr::max(value) > 0.f); }
+
+// How a path goes on from a surface.
+struct Scattering {
+    enum Kind : uint8_t { none, forward, specular, smooth };
+    Kind kind = none;
+    Vector3 local_direction;
+    Rgb weight;
+    float pdf = 0.f;
+};
+
+class TungstenPath final : public Variant::Integrator {
+  public:
+    using Base = Variant::Integrator;
+    using Scene = Variant::Scene;
+    using Sensor = Variant::Sensor;
+    using Medium = Variant::Medium;
+    using Emitter = Variant::Emitter;
+    using Texture = Variant::Texture;
+    using TensorXf = Base::TensorXf;
+
+    explicit TungstenPath(const Properties& properties)
+        : Base(properties),
+          min_bounces_(properties.get<int>("min_bounces", 0)),
+          max_bounces_(properties.get<int>("max_bounces", 64)),
+          light_sampling_(properties.get<bool>("enable_light_sampling", true)),
+          volume_light_sampling_(properties.get<bool>("enable_volume_light_sampling", true)),
+          consistency_checks_(properties.get<bool>("enable_consistency_checks", false)),
+          low_order_scattering_(properties.get<bool>("low_order_scattering", true)),
+          include_surfaces_(properties.get<bool>("include_surfaces", true)),
+          filter_(properties.get<std::string_view>("reconstruction_filter", "tent")),
+          pixel_center_(properties.get<float>("pixel_center", 0.5f)),
+          threads_(properties.get<uint32_t>("threads", 1)) {
+        std::istringstream names{std::string(
+            properties.get<std::string_view>("quantities", "color albedo normal depth visibility"))};
+        for (std::string name; names >> name;) {
+            const auto* found = std::find(quantity_names.begin(), quantity_names.end(), name);
+            if (found == quantity_names.end()) Throw("quantities: unknown quantity \"%s\"", name);
+            quantities_.push_back(static_cast<Quantity>(found - quantity_names.begin()));
+        }
+        constexpr std::string_view prefix = "albedo_";
+        for (const auto& property : properties)
+            if (property.name().starts_with(prefix))
+                albedos_.emplace(property.name().substr(prefix.size()),
+                                 properties.get_unbounded_texture<Texture>(property.name()));
+        records_features_ = std::any_of(quantities_.begin(), quantities_.end(),
+                                        [](Quantity quantity) { return quantity != color; });
+    }
+
+    void traverse(TraversalCallback* callback) override {
+        callback->put("progress", progress_, ParamFlags::NonDifferentiable);
+    }
+
+    TensorXf render(Scene* scene, Sensor* sensor, uint32_t seed, uint32_t spp, bool /*develop*/,
+                    bool /*evaluate*/) override {
+        m_stop = false;
+        m_render_timer.reset();
+        sees_through_ = has_transparency(*scene);
+        const auto size = sensor->film()->crop_size();
+        const size_t channels = pixel_channels();
+        std::vector<float> image(static_cast<size_t>(size.x()) * size.y() * channels);
+
+        const uint32_t tiles_x = (size.x() + tile_size - 1) / tile_size;
+        const uint32_t tiles = tiles_x * ((size.y() + tile_size - 1) / tile_size);
+        std::atomic<uint32_t> tiles_done = 0;
+        std::atomic_ref(progress_).store(0.f);
+        const std::unique_ptr<Pool, void (*)(Pool*)> pool(pool_create(threads_), pool_destroy);
+        dr::parallel_for(
+            dr::blocked_range<uint32_t>(0, tiles, 1),
+            [&](const dr::blocked_range<uint32_t>& range) {
+                for (const uint32_t tile : range) {
+                    const uint32_t x0 = tile % tiles_x * tile_size;
+                    const uint32_t y0 = tile / tiles_x * tile_size;
+                    for (uint32_t y = y0; y < std::min(y0 + tile_size, size.y()); ++y)
+                        for (uint32_t x = x0; x < std::min(x0 + tile_size, size.x()); ++x) {
+                            const uint32_t pixel = y * size.x() + x;
+                            render_pixel(*scene, *sensor, {x, y}, size, {seed, pixel}, spp,
+                                         &image[pixel * channels]);
+                        }
+                    std::atomic_ref(progress_).store(static_cast<float>(++tiles_done) /
+                                                     static_cast<float>(tiles));
+                }
+            },
+            pool.get());
+        const std::array<size_t, 3> shape{size.y(), size.x(), channels};
+        return TensorXf(image.data(), shape.size(), shape.data());
+    }
+
+    std::string to_string() const override {
+        return "TungstenPath[max_bounces=" + std::to_string(max_bounces_) + "]";
+    }
+
+    MI_DECLARE_CLASS(TungstenPath)
+
+  private:
+    [[nodiscard]] size_t pixel_channels() const {
+        size_t channels = 0;
+        for (const Quantity quantity : quantities_) channels += 3 * channel_count(quantity) + 1;
+        return channels;
+    }
+
+    // Whether a shadow ray can be anything but blocked or free.
+    static bool has_transparency(const Scene& scene) {
+        if ((scene.shape_types() & +ShapeType::Instance) != 0) return true;  // what is in it is not listed
+        return std::any_of(scene.shapes().begin(), scene.shapes().end(), [](const auto& shape) {
+            return shape->is_medium_transition() ||
+                   (shape->bsdf() && has_flag(shape->bsdf()->flags(), BSDFFlags::Null));
+        });
+    }
+
+    void render_pixel(const Scene& scene, const Sensor& sensor, Vector<uint32_t, 2> position,
+                      Vector<uint32_t, 2> size, Random random, uint32_t spp, float* out) const {
+        std::array<Accumulator, quantity_count> accumulators;
+        for (uint32_t i = 0; i < spp && !should_stop(); ++i) {
+            const Vector2 offset = filter_.sample(random.next_2d());
+            const Point2 film((static_cast<float>(position.x()) + pixel_center_ + offset.x()) /
+                                  static_cast<float>(size.x()),
+                              (static_cast<float>(position.y()) + pixel_center_ + offset.y()) /
+                                  static_cast<float>(size.y()));
+            const Point2 lens = sensor.needs_aperture_sample() ? random.next_2d() : Point2(0.5f);
+            const auto [ray, weight] = sensor.sample_ray(0.f, 0.f, film, lens);
+            Sample sample;
+            sample.set(color, weight * radiance(scene, sensor.medium(), ray, random, sample));
+            for (const Quantity quantity : quantities_)
+                if (const auto& value = sample.get(quantity)) accumulators[quantity].add(*value);
+        }
+        for (const Quantity quantity : quantities_) {
+            accumulators[quantity].store(channel_count(quantity), out);
+            out += 3 * channel_count(quantity) + 1;
+        }
+    }
+
+    // Follows one path. Features are recorded at the first surface where the path does not go on specularly
+    // or straight ahead; a path that a medium or chance ends before says nothing of them.
+    Rgb radiance(const Scene& scene, const Medium* medium, Ray3 ray, Random& random, Sample& sample) const {
+        Rgb result(0.f);
+        Rgb throughput(1.f);
+        bool recorded = !records_features_;
+        float distance = 0.f;
+        Point3 segment_start = ray.o;
+        int bounce = 0;
+        int medium_bounces = 0;
+        bool was_specular = true;
+        // The last vertex that scattered; emitters were sampled there if `samples_lights`.
+        Vertex vertex = dr::zeros<Vertex>();
+        float direction_pdf = 0.f;
+        bool samples_lights = false;
+
+        const auto emitted = [&](const SurfaceHit& hit, const Emitter& emitter) -> Rgb {
+            const Rgb emission = emitter.eval(hit);
+            if (was_specular || !samples_lights || is_black(emission)) return emission;
+            const Variant::DirectionSample3f towards(&scene, hit, vertex);
+            return emission * power_heuristic(direction_pdf, scene.pdf_emitter_direction(vertex, towards));
+        };
+
+        SurfaceHit hit = scene.ray_intersect(ray);
+        while ((hit.is_valid() || medium != nullptr) && bounce < max_bounces_) {
+            MediumHit medium_hit = dr::zeros<MediumHit>();
+            bool in_medium =
+                medium != nullptr && scatters(*medium, ray, hit.t, random, throughput, medium_hit);
+            if (!in_medium && !hit.is_valid()) break;
+
+            if (in_medium) {
+                ++medium_bounces;
+                samples_lights = volume_light_sampling_ && (medium_bounces > 1 || low_order_scattering_);
+                was_specular = !samples_lights;
+                const Variant::PhaseFunctionContext context(nullptr);
+                const auto* phase = medium->phase_function();
+                if (samples_lights && bounce < max_bounces_ - 1)
+                    result +=
+                        throughput *
+                        light_from(scene, medium_hit, bounce + 1, random, [&](const Vector3& direction) {
+                            return LightTransport{phase->eval_pdf(context, medium_hit, direction), medium};
+                        });
+                const float lobe = random.next();
+                const auto [direction, weight, pdf] =
+                    phase->sample(context, medium_hit, lobe, random.next_2d());
+                if (!(pdf > 0.f)) return result;
+                throughput *= weight;
+                vertex = medium_hit;
+                direction_pdf = pdf;
+                segment_start = medium_hit.p;
+                ray = medium_hit.spawn_ray(direction);
+            } else {
+                distance += dr::norm(hit.p - segment_start);
+                if (medium_bounces == 1 && !low_order_scattering_) return result;
+                const auto& bsdf = *hit.bsdf();
+                const Emitter* emitter = hit.shape->emitter();
+                const Scattering next = scatter(bsdf, hit, random);
+                const Vector3 direction = hit.to_world(next.local_direction);
+                const bool goes_on =
+                    next.kind == Scattering::forward ||
+                    (next.kind != Scattering::none && consistent(hit, direction, next.local_direction));
+                std::optional<float> light_visibility;
+                if (next.kind != Scattering::forward) {
+                    if (emitter != nullptr && bounce >= min_bounces_)
+                        result += throughput * emitted(hit, *emitter);
+                    samples_lights = light_sampling_ && (medium_bounces > 0 || include_surfaces_) &&
+                                     has_flag(bsdf.flags(), BSDFFlags::Smooth);
+                    if (samples_lights && bounce < max_bounces_ - 1)
+                        result +=
+                            throughput *
+                            light_from(
+                                scene, hit, bounce + 1, random,
+                                [&](const Vector3& towards) {
+                                    const Vector3 local = hit.to_local(towards);
+                                    if (!consistent(hit, towards, local)) return LightTransport{};
+                                    return LightTransport{
+                                        bsdf.eval_pdf(BSDFContext(), hit, local),
+                                        hit.is_medium_transition() ? hit.target_medium(towards) : medium};
+                                },
+                                &light_visibility);
+                    if (goes_on) {
+                        was_specular = next.kind == Scattering::specular;
+                        vertex = hit;
+                        direction_pdf = next.pdf;
+                    }
+                }
+                if (medium_bounces == 0 && !include_surfaces_ && has_flag(bsdf.flags(), BSDFFlags::Smooth))
+                    return result;
+
+                if (!recorded && (!was_specular || !goes_on)) {
+                    recorded = true;
+                    sample.set(depth, distance);
+                    sample.set(normal, Vector3(hit.sh_frame.n));
+                    sample.set(albedo, surface_albedo(bsdf, hit) +
+                                           (emitter != nullptr ? emitter->eval(hit) : Rgb(0.f)));
+                    if (light_visibility) sample.set(visibility, *light_visibility);
+                }
+                if (!goes_on) return result;
+                throughput *= next.weight;
+                if (hit.is_medium_transition()) medium = hit.target_medium(direction);
+                segment_start = hit.p;
+                ray = hit.spawn_ray(direction);
+            }
+
+            if (is_black(throughput)) break;
+            const float survival = dr::max(throughput);
+            if (bounce > 2 && survival < 0.1f) {
+                if (random.next() >= survival) return result;
+                throughput /= survival;
+            }
+            ++bounce;
+            if (bounce < max_bounces_) hit = scene.ray_intersect(ray);
+        }
+
+        const bool meets_sky =
+            scene.environment() != nullptr && bounce >= min_bounces_ && bounce < max_bounces_;
+        SurfaceHit sky = dr::zeros<SurfaceHit>();
+        sky.t = dr::Infinity<float>;
+        sky.wi = -ray.d;
+        if (meets_sky) result += throughput * emitted(sky, *scene.environment());
+        if (!recorded) {
+            if (bounce == 0) sample.set(depth, 0.f);
+            sample.set(normal, -ray.d);
+            if (meets_sky) sample.set(albedo, Rgb(scene.environment()->eval(sky)));
+        }
+        return result;
+    }
+
+    static Scattering scatter(const Variant::BSDF& bsdf, const SurfaceHit& hit, Random& random) {
+        const float lobe = random.next();
+        const auto [sample, weight] = bsdf.sample(BSDFContext(), hit, lobe, random.next_2d());
+        Scattering result{
+            .kind = Scattering::none, .local_direction = sample.wo, .weight = weight, .pdf = sample.pdf};
+        if (!(sample.pdf > 0.f)) return result;
+        if (has_flag(sample.sampled_type, BSDFFlags::Null))
+            result.kind = Scattering::forward;
+        else if (has_flag(sample.sampled_type, BSDFFlags::Delta))
+            result.kind = Scattering::specular;
+        else
+            result.kind = Scattering::smooth;
+        return result;
+    }
+
+    [[nodiscard]] bool consistent(const SurfaceHit& hit, const Vector3& direction,
+                                  const Vector3& local) const {
+        return !consistency_checks_ || (dr::dot(hit.n, direction) < 0.f) == (local.z() < 0.f);
+    }
+
+    [[nodiscard]] Rgb surface_albedo(const Variant::BSDF& bsdf, const SurfaceHit& hit) const {
+        const auto found = albedos_.find(bsdf.id());
+        if (found == albedos_.end()) Throw("no texture \"albedo_%s\" for the BSDF of that id", bsdf.id());
+        return found->second->eval(hit);
+    }
+
+    // Decides whether a medium scatters before the surface at distance `surface_t`, and weighs the
+    // throughput.
+    static bool scatters(const Medium& medium, Ray3 ray, float surface_t, Random& random, Rgb& throughput,
+                         MediumHit& hit) {
+        if (medium.is_homogeneous()) {
+            // The channel that picks the distance is random; the balance heuristic over all three keeps
+            // colour noise low.
+            const auto channel = static_cast<uint32_t>(3.f * random.next());
+            hit = medium.sample_interaction(ray, random.next(), std::min(channel, 2U), true);
+            SurfaceHit surface = dr::zeros<SurfaceHit>();
+            surface.t = surface_t;
+            const auto [transmittance, pdf] = medium.transmittance_eval_pdf(hit, surface, true);
+            const float mean_pdf = dr::mean(pdf);
+            throughput *= mean_pdf > 0.f ? transmittance / mean_pdf : Rgb(0.f);
+            if (!hit.is_valid() || hit.t >= surface_t) return false;
+            throughput *= hit.sigma_s;
+            return true;
+        }
+        // Delta tracking (Woodcock et al., 1965).
+        for (float travelled = 0.f;;) {
+            hit = medium.sample_interaction(ray, random.next(), 0, true);
+            if (!hit.is_valid() || travelled + hit.t >= surface_t) return false;
+            travelled += hit.t;
+            const Rgb null_ratio = hit.sigma_n / hit.combined_extinction;
+            const float null_probability = dr::mean(null_ratio);
+            if (random.next() >= null_probability) {
+                throughput *= hit.sigma_s / hit.combined_extinction / (1.f - null_probability);
+                return true;
+            }
+            throughput *= null_ratio / null_probability;
+            ray.o = hit.p;
+        }
+    }
+
+    // How a vertex passes light on: its value and pdf for a direction, and the medium that lies there.
+    struct LightTransport {
+        std::pair<Rgb, float> value_pdf{0.f, 0.f};
+        const Medium* medium = nullptr;
+    };
+
+    // The light that one sampled emitter sends along the path through `from`; `visibility` is how much of it
+    // arrives.
+    template <typename Hit, typename Transport>
+    Rgb light_from(const Scene& scene, const Hit& from, int bounce, Random& random,
+                   const Transport& transport, std::optional<float>* visibility_out = nullptr) const {
+        const auto [towards, emission] = scene.sample_emitter_direction(from, random.next_2d(), false);
+        if (!(towards.pdf > 0.f)) return {0.f};
+        const LightTransport vertex = transport(towards.d);
+        const auto& [value, pdf] = vertex.value_pdf;
+        if (is_black(value)) return {0.f};
+        const Rgb passed =
+            transmittance(scene, from.spawn_ray_to(towards.p), towards.p, vertex.medium, bounce, random);
+        if (visibility_out != nullptr) *visibility_out = dr::mean(passed);
+        const float weight = towards.delta ? 1.f : power_heuristic(towards.pdf, pdf);
+        return value * emission * passed * weight;
+    }
+
+    // What of the light reaches `target` along a ray; every transparent surface on the way is a bounce.
+    Rgb transmittance(const Scene& scene, Ray3 ray, const Point3& target, const Medium* medium, int bounce,
+                      Random& random) const {
+        if (!sees_through_ && medium == nullptr)
+            return {bounce < min_bounces_ || scene.ray_test(ray) ? 0.f : 1.f};
+        for (Rgb result(1.f);;) {
+            const SurfaceHit hit = scene.ray_intersect(ray);
+            if (hit.is_valid()) {
+                result *= hit.bsdf()->eval_null_transmission(hit);
+                if (is_black(result) || ++bounce >= max_bounces_) return {0.f};
+            }
+            if (medium != nullptr) result *= transmittance(*medium, ray, std::min(hit.t, ray.maxt), random);
+            if (!hit.is_valid()) return bounce >= min_bounces_ ? result : Rgb(0.f);
+            if (hit.is_medium_transition()) medium = hit.target_medium(ray.d);
+            ray = hit.spawn_ray_to(target);
+        }
+    }
+
+    static Rgb transmittance(const Medium& medium, Ray3 ray, float distance, Random& random) {
+        if (medium.is_homogeneous()) return dr::exp(-distance * medium.get_majorant(dr::zeros<MediumHit>()));
+        // Ratio tracking (Novak et al., "Residual Ratio Tracking", SIGGRAPH Asia 2014).
+        Rgb result(1.f);
+        for (float travelled = 0.f;;) {
+            const MediumHit hit = medium.sample_interaction(ray, random.next(), 0, true);
+            travelled += hit.t;
+            if (!hit.is_valid() || travelled >= distance) return result;
+            result *= hit.sigma_n / hit.combined_extinction;
+            ray.o = hit.p;
+        }
+    }
+
+    int min_bounces_;
+    int max_bounces_;
+    bool light_sampling_;
+    bool volume_light_sampling_;
+    bool consistency_checks_;
+    bool low_order_scattering_;
+    bool include_surfaces_;
+    FilterTable filter_;
+    float pixel_center_;
+    uint32_t threads_;
+    std::vector<Quantity> quantities_;
+    std::map<std::string, ref<Texture>, std::less<>> albedos_;
+    bool records_features_ = false;
+    bool sees_through_ = true;
+    float progress_ = 0.f;
+};
+
+}  // namespace
+}  // namespace mitsuba
+
+extern "C" __attribute__((visibility("default"))) void init_plugin(std::string_view name,
+                                                                   mitsuba::PluginRegisterFn add) {
+    add(name, "scalar_rgb", mitsuba::TungstenPath::Type, [](void*, const mitsuba::Properties& properties) {
+        return mitsuba::ref<mitsuba::Object>(new mitsuba::TungstenPath(properties));
+    });
+}

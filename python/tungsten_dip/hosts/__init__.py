@@ -1,0 +1,45 @@
+"""Who renders: Tungsten itself where the package was built against it, or Mitsuba 3 with our plugins."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.progress import Progress, silent
+from tungsten_dip.scene.parse import load_scene
+from tungsten_dip.scene.types import Scene
+
+_log = logging.getLogger(__name__)
+
+Host = Literal["auto", "tungsten", "mitsuba"]
+
+
+def render(
+    scene: Scene | Path | str,
+    host: Host = "auto",
+    spp: int | None = None,
+    seed: int | None = None,
+    threads: int | None = None,
+    timeout_s: float | None = None,
+    progress: Progress = silent,
+) -> RenderBuffers:
+    """Render a scene, given itself or its file, and return colour and features with independent halves.
+
+    ``host`` "auto" is Tungsten where the package was built against it, else Mitsuba. None takes the scene's
+    ``spp``, the host's own seed, all cores, and no timeout. Writes no file.
+
+    Raises InputError if the scene or the host cannot be used.
+    """
+    from tungsten_dip.hosts import tungsten
+    from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
+
+    if host == "auto":
+        host = "tungsten" if tungsten.available() else "mitsuba"
+    if not isinstance(scene, Scene):
+        scene = load_scene(scene)
+    _log.info("%s: rendered by %s", scene.path, host.capitalize())
+    if host == "tungsten":
+        return tungsten.render(scene.path, spp=spp, seed=seed, threads=threads, progress=progress)
+    return render_with_mitsuba(scene, spp, seed or 0, threads, timeout_s, progress)

@@ -1,0 +1,240 @@
+"""Renders a scene with Mitsuba and our integrator ``tungsten_path`` (mitsuba_ext/tungsten_path.cpp).
+
+Samples per pixel are fixed: adaptive sampling and Sobol points, which a scene may ask for, would break the
+independence of the halves and are not used.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
+from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
+from tungsten_dip.progress import Progress, silent
+from tungsten_dip.scene.types import Scene
+
+Doubles = npt.NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+QUANTITIES = ("color", "albedo", "normal", "depth")
+"""What is rendered unless something else is asked for; colour is always there."""
+
+_POLL_S = 0.1
+_TRACE_SETTINGS = (
+    "min_bounces",
+    "max_bounces",
+    "enable_consistency_checks",
+    "enable_light_sampling",
+    "enable_volume_light_sampling",
+    "low_order_scattering",
+    "include_surfaces",
+)
+
+
+def render(
+    scene: Scene,
+    spp: int | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    timeout_s: float | None = None,
+    progress: Progress = silent,
+    quantities: Sequence[str] = QUANTITIES,
+) -> RenderBuffers:
+    """Render a scene with ``spp`` samples per pixel (None: the scene's); writes no file.
+
+    The result depends on ``seed`` (0 to 2^32 - 1), not on ``threads`` (None: all cores). Samples go to halves
+    A and B by turns and are independent, so the halves are; with 1 spp there are neither halves nor a
+    variance. After ``timeout_s`` seconds the render ends at the next step of the scene's ``spp_step``.
+
+    Raises InputError if Mitsuba is missing or cannot show what the scene calls for, or an argument is out of
+    range, and KeyboardInterrupt within a moment of Ctrl-C.
+    """
+    if scene.renderer.adaptive_sampling or scene.renderer.stratified_sampler:
+        _log.info(
+            "adaptive_sampling and stratified_sampler rest: every pixel gets as many independent samples"
+        )
+    with mitsuba_variant():
+        from tungsten_dip.hosts.mitsuba.translate import translate
+
+        return render_translated(
+            translate(scene),
+            scene.renderer.spp if spp is None else spp,
+            seed,
+            threads,
+            timeout_s,
+            scene.renderer.spp_step,
+            progress,
+            quantities,
+        )
+
+
+def render_translated(
+    translated: TranslatedScene,
+    spp: int,
+    seed: int = 0,
+    threads: int | None = None,
+    timeout_s: float | None = None,
+    spp_step: int = 16,
+    progress: Progress = silent,
+    quantities: Sequence[str] = QUANTITIES,
+) -> RenderBuffers:
+    """Render a translated scene; `render` says what comes back and what is raised.
+
+    With ``timeout_s`` the picture is rendered in passes of ``spp_step``, and no pass begins after that time;
+    at least one is rendered, and the buffers tell the spp that were reached.
+    """
+    for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
+        if value is not None and value < 1:
+            raise InputError(f"{name}: expected a number above 0, got {value}")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {seed}")
+    started = time.perf_counter()
+    with mitsuba_variant() as mitsuba:
+        try:
+            scene = mitsuba.load_dict(
+                _scene_with_integrator(translated, threads, quantities), parallel=False, optimize=False
+            )
+        except RuntimeError as error:
+            raise InputError(f"Mitsuba cannot load the scene: {error}") from None
+        done_spp = 0
+        statistics: dict[str, _Statistics] = {}
+        while done_spp < spp:
+            if done_spp and timeout_s is not None and time.perf_counter() - started > timeout_s:
+                _log.info("out of time after %d of %d spp", done_spp, spp)
+                break
+            pass_spp = min(spp - done_spp, spp if timeout_s is None else spp_step)
+            pass_seed = int(np.random.SeedSequence([seed, done_spp]).generate_state(1)[0])
+            pixels = _render_pass(
+                mitsuba, scene, pass_spp, pass_seed, _part(progress, done_spp, pass_spp, spp)
+            )
+            for name, rendered in _statistics(pixels, quantities).items():
+                statistics[name] = statistics[name].merged(rendered) if name in statistics else rendered
+            done_spp += pass_spp
+    _log.info("Mitsuba %s rendered %d spp in %.1f s", VERSION, done_spp, time.perf_counter() - started)
+    if done_spp == 1:
+        _log.warning("1 sample per pixel has no halves and no variance; render at least 2")
+    buffers = {name: known.buffer(has_halves=done_spp > 1) for name, known in statistics.items()}
+    return RenderBuffers(
+        color=buffers.pop("color"),
+        **buffers,  # type: ignore[arg-type]
+        spp=float(done_spp),
+        attributes={"renderer": f"Mitsuba {VERSION}", "integrator": "path_tracer", "seed": seed},
+    )
+
+
+def _scene_with_integrator(
+    translated: TranslatedScene, threads: int | None, quantities: Sequence[str]
+) -> dict[str, Any]:
+    integrator = {
+        "type": "tungsten_path",
+        "quantities": " ".join(quantities),
+        "threads": threads or len(os.sched_getaffinity(0)),
+        "reconstruction_filter": translated.reconstruction_filter,
+        "pixel_center": translated.pixel_center,
+        **{name: getattr(translated.integrator, name) for name in _TRACE_SETTINGS},
+        **{f"albedo_{bsdf}": texture for bsdf, texture in translated.albedo.items()},
+    }
+    return {**translated.scene, "integrator": integrator}
+
+
+def _part(progress: Progress, done_spp: int, pass_spp: int, spp: int) -> Progress:
+    return lambda fraction, message: progress((done_spp + fraction * pass_spp) / spp, message)
+
+
+def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progress) -> Doubles:
+    """Render in a thread of its own, so that this one can report progress and be interrupted."""
+    integrator = scene.integrator()
+    parameters = mitsuba.traverse(integrator)
+    level = mitsuba.log_level()
+    mitsuba.set_log_level(
+        mitsuba.LogLevel.Error
+    )  # Mitsuba logs from its handler of Ctrl-C, where Python cannot
+    try:
+        with ThreadPoolExecutor(max_workers=1) as executor:
+            rendering = executor.submit(integrator.render, scene, scene.sensors()[0], seed, spp)
+            try:
+                while not wait([rendering], timeout=_POLL_S).done:
+                    progress(float(parameters["progress"]), "rendering")
+            except BaseException:
+                integrator.cancel()
+                raise
+    finally:
+        mitsuba.set_log_level(level)
+    pixels = np.array(rendering.result(), dtype=np.float64)
+    if integrator.should_stop():
+        raise KeyboardInterrupt
+    progress(1.0, "rendering")
+    return pixels
+
+
+@dataclass(frozen=True)
+class _Statistics:
+    """What is known of one quantity, shape (height, width, channels); the counts have one channel."""
+
+    half_a: Doubles
+    half_b: Doubles
+    count_a: Doubles
+    count_b: Doubles
+    squared_deviations: Doubles
+
+    @property
+    def count(self) -> Doubles:
+        return self.count_a + self.count_b
+
+    @property
+    def mean(self) -> Doubles:
+        return _weighted_mean(self.half_a, self.count_a, self.half_b, self.count_b)
+
+    def merged(self, other: _Statistics) -> _Statistics:
+        """Pool two sets of samples (Chan, Golub and LeVeque, The American Statistician 37, 1983)."""
+        shift = (
+            (other.mean - self.mean) ** 2 * self.count * other.count / np.maximum(self.count + other.count, 1)
+        )
+        return _Statistics(
+            _weighted_mean(self.half_a, self.count_a, other.half_a, other.count_a),
+            _weighted_mean(self.half_b, self.count_b, other.half_b, other.count_b),
+            self.count_a + other.count_a,
+            self.count_b + other.count_b,
+            self.squared_deviations + other.squared_deviations + shift,
+        )
+
+    def buffer(self, has_halves: bool) -> Buffer:
+        """Return the means and the variance of the mean, as Tungsten writes them."""
+        mean = self.mean.astype(np.float32)
+        if not has_halves:
+            return Buffer(mean)
+        variance = self.squared_deviations / np.maximum(self.count * (self.count - 1), 1)
+        return Buffer(mean, *(plane.astype(np.float32) for plane in (self.half_a, self.half_b, variance)))
+
+
+def _weighted_mean(a: Doubles, weight_a: Doubles, b: Doubles, weight_b: Doubles) -> Doubles:
+    return (a * weight_a + b * weight_b) / np.maximum(weight_a + weight_b, 1)
+
+
+def _statistics(pixels: Doubles, quantities: Sequence[str]) -> dict[str, _Statistics]:
+    """Split what the integrator returns; mitsuba_ext/tungsten_path.cpp describes it."""
+    statistics = {}
+    start = 0
+    for name in quantities:
+        channels = CHANNELS[name]
+        half_a, half_b, squared_deviations = (
+            pixels[..., start + i * channels : start + (i + 1) * channels] for i in range(3)
+        )
+        start += 3 * channels + 1
+        count = pixels[..., start - 1 : start]
+        statistics[name] = _Statistics(
+            half_a, half_b, np.ceil(count / 2), np.floor(count / 2), squared_deviations
+        )
+    return statistics
