@@ -126,11 +126,11 @@ Array calibrate_variance_array(const py::array& variance, const py::array& half_
     return out;
 }
 
-HalvesTest test_halves_arrays(const py::array& half_a, const py::array& half_b, const OptionalArray& variance,
-                              int threads) {
+HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_b,
+                                 const OptionalArray& variance, int threads) {
     const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
     const py::gil_scoped_release release;
-    return test_halves(buffer.half_a, buffer.half_b, buffer.variance, threads);
+    return compare_halves(buffer.half_a, buffer.half_b, buffer.variance, threads);
 }
 
 py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_a, const py::array& half_b,
@@ -159,6 +159,7 @@ PYBIND11_MODULE(_core, module) {
         .def_readonly("infinite", &Defects::infinite)
         .def_readonly("negative", &Defects::negative);
     py::class_<HalvesTest>(module, "HalvesTest")
+        .def(py::init<>())
         .def_readonly("correlation", &HalvesTest::correlation)
         .def_readonly("variance_ratio", &HalvesTest::variance_ratio)
         .def_readonly("pixels_used", &HalvesTest::pixels_used)
@@ -170,8 +171,8 @@ PYBIND11_MODULE(_core, module) {
                py::arg("threads") = 0);
     module.def("calibrate_variance", &calibrate_variance_array, py::arg("variance"), py::arg("half_a"),
                py::arg("half_b"), py::arg("threads") = 0);
-    module.def("test_halves", &test_halves_arrays, py::arg("half_a"), py::arg("half_b"), py::arg("variance"),
-               py::arg("threads") = 0);
+    module.def("compare_halves", &compare_halves_arrays, py::arg("half_a"), py::arg("half_b"),
+               py::arg("variance"), py::arg("threads") = 0);
     module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),
                py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
 }

@@ -8,6 +8,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <functional>
+#include <limits>
 #include <type_traits>
 
 namespace tungsten_dip {
@@ -103,12 +104,14 @@ void calibrate_variance(ConstImage variance, ConstImage half_a, ConstImage half_
 
 // Whether the noise of two halves is independent, as everything that scores one half by the other assumes.
 struct HalvesTest {
-    double correlation = 0;     // of the two halves' errors; NaN if nothing in the image tells
-    double variance_ratio = 0;  // mean sample variance of the mean over the halves' one; NaN if unknown
+    // Of the two halves' errors; NaN if nothing in the image tells.
+    double correlation = std::numeric_limits<double>::quiet_NaN();
+    // Mean sample variance of the mean over the mean variance between the halves; NaN if unknown.
+    double variance_ratio = std::numeric_limits<double>::quiet_NaN();
     std::int64_t pixels_used = 0;
     bool independent = false;  // false as well where nothing in the image tells
 };
-HalvesTest test_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads);
+HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads);
 
 // --- prefilter.cpp
 // --------------------------------------------------------------------------------------------

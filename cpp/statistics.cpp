@@ -241,7 +241,7 @@ void calibrate_variance(ConstImage variance, ConstImage half_a, ConstImage half_
     });
 }
 
-HalvesTest test_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads) {
+HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads) {
     const Correlation correlation = measure_correlation(half_a, half_b, threads);
     const Ratio ratio = variance.known() ? measure_ratio(half_a, half_b, variance, threads) : Ratio{};
 

@@ -4,7 +4,10 @@ from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.buffers.image_file import read_image, write_image
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.read import read_buffers
+from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.buffers.statistics import HalvesTest, halves_independent, variance_of_mean
 from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 
 __all__ = [
@@ -13,11 +16,16 @@ __all__ = [
     "PLANES",
     "Buffer",
     "FloatImage",
+    "HalvesTest",
     "RenderBuffers",
     "check_writable",
+    "halves_independent",
+    "prefilter_features",
     "read_buffers",
     "read_image",
     "replacing",
+    "sanitize",
+    "variance_of_mean",
     "write_denoised",
     "write_image",
     "write_tungsten_folder",

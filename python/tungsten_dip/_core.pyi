@@ -1,0 +1,69 @@
+"""The core in C++. Arrays are float32, C-contiguous, of shape (height, width, channels), and are never modified.
+
+Every function raises TypeError for another dtype and ValueError for another shape or layout; none converts.
+Inputs are read in place, also read-only ones. The interpreter lock is released during long work. ``threads`` 0
+uses every core; no result depends on it.
+"""
+
+from tungsten_dip.buffers.model import FloatImage
+
+__version__: str
+
+class Defects:
+    """How many values of an image no renderer can have meant."""
+
+    @property
+    def nan(self) -> int: ...
+    @property
+    def infinite(self) -> int: ...
+    @property
+    def negative(self) -> int: ...
+
+class HalvesTest:
+    """Whether the noise of two half buffers is independent. Without arguments: nothing is known.
+
+    ``correlation`` is that of the halves' errors, ``variance_ratio`` the sample variance of the mean over the
+    variance between the halves (1 for independent samples); both are NaN where unknown. ``pixels_used`` went
+    into ``correlation``. ``independent`` is False as well where nothing in the image tells.
+    """
+
+    def __init__(self) -> None: ...
+    @property
+    def correlation(self) -> float: ...
+    @property
+    def variance_ratio(self) -> float: ...
+    @property
+    def pixels_used(self) -> int: ...
+    @property
+    def independent(self) -> bool: ...
+
+def sanitize(
+    quantity: str,
+    mean: FloatImage,
+    half_a: FloatImage | None,
+    half_b: FloatImage | None,
+    variance: FloatImage | None,
+    threads: int = 0,
+) -> tuple[
+    tuple[FloatImage, FloatImage | None, FloatImage | None, FloatImage | None],
+    tuple[Defects, Defects, Defects, Defects],
+]:
+    """Return (mean, half_a, half_b, variance), mended copies of those with defects, and the defects of each."""
+
+def halves_variance(half_a: FloatImage, half_b: FloatImage, threads: int = 0) -> FloatImage:
+    """Return (half_a - half_b)^2 / 4, an unbiased and very noisy estimate of the variance of the mean."""
+
+def calibrate_variance(
+    variance: FloatImage, half_a: FloatImage, half_b: FloatImage, threads: int = 0
+) -> FloatImage:
+    """Return the sample variance, scaled so that its 21x21 pixel mean is that of the halves' variance."""
+
+def compare_halves(
+    half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0
+) -> HalvesTest:
+    """Test the halves of a colour for independence."""
+
+def prefilter_feature(
+    mean: FloatImage, half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0
+) -> tuple[FloatImage, FloatImage, FloatImage, FloatImage]:
+    """Return the cross-filtered (mean, half_a, half_b) of a feature and the variance that remains."""

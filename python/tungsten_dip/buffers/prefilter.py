@@ -1,0 +1,26 @@
+"""Pre-filtering of features: less noise where there is some, nothing changed where there is none."""
+
+from __future__ import annotations
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.model import FEATURES, Buffer, RenderBuffers
+
+
+def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:
+    """Return buffers whose features are filtered by non-local means, each half with the other's weights.
+
+    As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
+    Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it. Values
+    whose halves agree and whose variance is 0 pass through to the bit, and so do features without halves.
+    Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
+    """
+    filtered: dict[str, Buffer | None] = {}
+    for name in FEATURES:
+        feature: Buffer | None = getattr(buffers, name)
+        if feature is not None and feature.half_a is not None and feature.half_b is not None:
+            filtered[name] = Buffer(
+                *_core.prefilter_feature(
+                    feature.mean, feature.half_a, feature.half_b, feature.variance, threads or 0
+                )
+            )
+    return buffers.with_quantities(**filtered)

@@ -1,0 +1,38 @@
+"""Mending of values that no renderer can have meant, before anything is computed from them."""
+
+from __future__ import annotations
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.model import Buffer, RenderBuffers
+
+_PLANES = ("", " half A", " half B", " variance")
+
+
+def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Mend NaN, infinite and negative values; return mended buffers and, for the log, a line per mended quantity.
+
+    No radiance is clamped, however large. Negative values become 0 (normals may be negative), and so does an
+    infinite depth (1e9 and more), which marks the sky. Everything else is rebuilt: the mean and the halves from
+    one another, a variance from the halves, and what remains from the sane pixels around it. Arrays without
+    defects are shared with ``buffers``, which are not modified. ``threads`` None uses every core.
+    """
+    mended: dict[str, Buffer | None] = {}
+    lines = []
+    for quantity, buffer in buffers.quantities():
+        planes, defects = _core.sanitize(
+            quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, threads or 0
+        )
+        found = [
+            f"{quantity}{plane} {_counts(counts)}"
+            for plane, counts in zip(_PLANES, defects, strict=True)
+            if _counts(counts)
+        ]
+        if found:
+            mended[quantity] = Buffer(*planes)
+            lines.append(f"mended {'; '.join(found)}")
+    return buffers.with_quantities(**mended), tuple(lines)
+
+
+def _counts(defects: _core.Defects) -> str:
+    counts = {"NaN": defects.nan, "infinite": defects.infinite, "negative": defects.negative}
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
