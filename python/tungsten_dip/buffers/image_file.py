@@ -40,19 +40,15 @@ def read_parts(path: Path) -> tuple[Part, ...]:
 
     Raises InputError if the file is missing, no such image, deep, truncated or larger than MAX_PIXELS.
     """
-    if path.suffix.lower() not in RADIANCE_SUFFIXES:
-        raise InputError(
-            f"{path}: expected an image in {', '.join(RADIANCE_SUFFIXES)}, which hold linear radiance"
-        )
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name")
+    if path.suffix.lower() not in RADIANCE_SUFFIXES:
+        raise InputError(f"{path}: holds no linear radiance; expected {', '.join(RADIANCE_SUFFIXES)}")
     config = oiio.ImageSpec()
     config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
     image = oiio.ImageInput.open(str(path), config)
     if image is None:
-        raise InputError(
-            f"{path}: cannot be read as an image ({_one_line(oiio.geterror())}); render it again"
-        )
+        raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
     try:
         parts: list[Part] = []
         while image.seek_subimage(len(parts), 0):
@@ -181,4 +177,4 @@ def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _one_line(message: str) -> str:
-    return " ".join(message.split()) or "no reason given"
+    return next((line.strip() for line in message.splitlines() if line.strip()), "no reason given")

@@ -181,8 +181,9 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
             if part.window != main.window:
                 raise InputError(_sizes_differ(f"{path}: {key}", part, main))
         stacked = np.stack([owner[name][1].astype(np.float32) for name in names], axis=-1)
-        planes[key] = _with_channels(stacked, _CHANNEL_COUNT.get(key, 1), f"{path}: {key}", names)
+        planes[key] = _with_channel_count(stacked, path, key, names)
     spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
+    spp = float(spp) if isinstance(spp, (int, float)) and spp > 0 else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
     buffers = {}
@@ -191,11 +192,8 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         known = {field: quantity + suffix for field, suffix in PLANES.items() if quantity + suffix in planes}
         if "mean" in known:
             buffers[quantity] = Buffer(**{field: planes[key] for field, key in known.items()})
-            log.info(
-                "%s: %s",
-                quantity,
-                "; ".join(f"{field} {', '.join(groups[key])}" for field, key in known.items()),
-            )
+            taken = (f"{field} {_shown(groups[key])}" for field, key in known.items())
+            log.info("%s: %s", quantity, ", ".join(taken))
     if "alpha" in planes:
         log.info("alpha: %s", groups["alpha"][0])
     if found.ignored:
@@ -219,16 +217,16 @@ def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, Channel]]:
     return names
 
 
-def _with_channels(image: FloatImage, count: int, label: str, names: tuple[str, ...]) -> FloatImage:
+def _with_channel_count(image: FloatImage, path: Path, key: str, names: tuple[str, ...]) -> FloatImage:
     """Make one channel of equal ones, and three equal channels of one."""
-    given = image.shape[2]
+    given, count = image.shape[2], _CHANNEL_COUNT.get(key, 1)
     if given == count:
         return image
     if count == 1 and all(np.array_equal(image[..., 0], image[..., k], equal_nan=True) for k in range(given)):
         return np.ascontiguousarray(image[..., :1])
-    if count == 3 and given == 1:
+    if count == 3 and given == 1 and not key.startswith("normal"):
         return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
-    raise InputError(f"{label}: expected {count} channels, found {', '.join(names)}; choose with --map")
+    raise InputError(f"{path}: {key}: expected {count} channels, found {', '.join(names)}; choose with --map")
 
 
 def _settle_variance(
@@ -247,6 +245,14 @@ def _settle_variance(
     else:
         del planes["colorVariance"]
         log.info("ignored: Variance, of unknown scale; if it is of the mean: --map colorVariance=Variance")
+
+
+def _shown(names: tuple[str, ...]) -> str:
+    """Channels in short, such as albedo.RGB."""
+    layer, dot, _ = names[0].rpartition(".")
+    if any(name.rpartition(".")[0] != layer for name in names):
+        return "+".join(names)
+    return layer + dot + "".join(name.removeprefix(layer + dot) for name in names)
 
 
 def _sizes_differ(label: str, part: Part, color: Part) -> str:

@@ -149,6 +149,8 @@ def _source_from_buffers(buffers: RenderBuffers) -> Source:
     for quantity, buffer in buffers.quantities():
         for field, plane in buffer.planes():
             channels |= _channels(f"{quantity}{PLANES[field]}.", _COMPONENTS[quantity], plane)
+    if buffers.alpha is not None:
+        channels["color.A"] = buffers.alpha[..., 0]
     if isinstance(buffers.spp, np.ndarray):
         channels["spp.Y"] = buffers.spp[..., 0]
     return Source((Part(channels),))

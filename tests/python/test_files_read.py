@@ -1,0 +1,518 @@
+"""Reading buffers: every input that renderers leave behind, and what is wrong with some of them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import string
+import struct
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image
+from tungsten_dip.errors import InputError
+
+HEIGHT, WIDTH = 5, 7
+
+
+def pixels(seed: int, dtype: type = np.float32, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, width)).astype(dtype)
+
+
+def save(path: Path, *names: str, dtype: type = np.float32, **header: object) -> dict[str, np.ndarray]:
+    """Save channels of different noise and return them."""
+    channels = {name: pixels(index, dtype) for index, name in enumerate(names)}
+    save_channels(path, channels, **header)
+    return channels
+
+
+def save_channels(path: Path, channels: dict[str, np.ndarray], **header: object) -> None:
+    copies = {name: channel.copy() for name, channel in channels.items()}
+    OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, copies).write(str(path))
+
+
+def save_parts(path: Path, **parts: dict[str, np.ndarray]) -> None:
+    window = np.array([0, 0], "i"), np.array([WIDTH - 1, HEIGHT - 1], "i")  # display windows must agree
+    header = {"type": OpenEXR.scanlineimage, "displayWindow": window}
+    OpenEXR.File(
+        [
+            OpenEXR.Part(header.copy(), {n: c.copy() for n, c in channels.items()}, name)
+            for name, channels in parts.items()
+        ]
+    ).write(str(path))
+
+
+def rgb(layer: str) -> list[str]:
+    return [f"{layer}.{component}" for component in "RGB"]
+
+
+def xyz(layer: str) -> list[str]:
+    return [f"{layer}.{component}" for component in "XYZ"]
+
+
+def holds(buffer: Buffer | None, channels: dict[str, np.ndarray], *names: str) -> bool:
+    assert buffer is not None
+    return np.array_equal(buffer.mean, np.stack([channels[name] for name in names], axis=-1))
+
+
+# Channels as the renderer names them, and what must be found: quantity -> channels. None: nothing.
+RENDERERS = {
+    "blender": (
+        [
+            *[f"ViewLayer.Combined.{c}" for c in "RGBA"],
+            "ViewLayer.Depth.Z",
+            *xyz("ViewLayer.Normal"),
+            *rgb("ViewLayer.DiffCol"),
+            *rgb("ViewLayer.DiffDir"),
+            "ViewLayer.Mist.Z",
+        ],
+        {
+            "color": rgb("ViewLayer.Combined"),
+            "albedo": rgb("ViewLayer.DiffCol"),
+            "normal": xyz("ViewLayer.Normal"),
+            "depth": ["ViewLayer.Depth.Z"],
+            "alpha": ["ViewLayer.Combined.A"],
+        },
+    ),
+    "blender, denoised by itself": (
+        [
+            *rgb("Composite.Combined"),
+            *rgb("ViewLayer.Combined"),
+            *rgb("ViewLayer.Noisy Image"),
+            *rgb("ViewLayer.Denoising Albedo"),
+            *rgb("ViewLayer.DiffCol"),
+            *xyz("ViewLayer.Denoising Normal"),
+            *xyz("ViewLayer.Normal"),
+            "ViewLayer.Denoising Depth.Z",
+        ],
+        {
+            "color": rgb("ViewLayer.Noisy Image"),
+            "albedo": rgb("ViewLayer.Denoising Albedo"),
+            "normal": xyz("ViewLayer.Denoising Normal"),
+            "depth": ["ViewLayer.Denoising Depth.Z"],
+        },
+    ),
+    "blender, two view layers": (
+        [
+            *rgb("Back.Normal"),
+            *rgb("Front.DiffCol"),
+            *rgb("Front.Noisy Image"),
+            *rgb("Back.Combined"),
+            *rgb("Back.Denoising Albedo"),
+        ],
+        {"color": rgb("Front.Noisy Image"), "albedo": rgb("Front.DiffCol"), "normal": rgb("Back.Normal")},
+    ),
+    "arnold": (
+        [
+            *"RGBA",
+            *rgb("diffuse_albedo"),
+            *rgb("denoise_albedo"),
+            *xyz("N"),
+            *xyz("P"),
+            "Z",
+            *rgb("variance"),
+        ],
+        {
+            "color": [*"RGB"],
+            "albedo": rgb("denoise_albedo"),
+            "normal": xyz("N"),
+            "depth": ["Z"],
+            "alpha": ["A"],
+        },
+    ),
+    "arnold, layer names kept": (
+        [*rgb("RGBA"), "RGBA.A", *xyz("N"), *xyz("N_noice"), "Z.Z", "Z_noice.Z"],
+        {"color": rgb("RGBA"), "normal": xyz("N_noice"), "depth": ["Z_noice.Z"], "alpha": ["RGBA.A"]},
+    ),
+    "pbrt": (
+        [*"RGB", *rgb("Albedo"), *xyz("P"), "dzdx", "dzdy", *xyz("N"), *xyz("Ns"), "u", "v"],
+        {"color": [*"RGB"], "albedo": rgb("Albedo"), "normal": xyz("Ns")},
+    ),
+    "mitsuba": (
+        [*"RGB", *rgb("albedo"), "dd.y.T", *rgb("img"), "img.A", *xyz("nn"), *xyz("pos")],
+        {"color": [*"RGB"], "albedo": rgb("albedo"), "normal": xyz("nn"), "depth": ["dd.y.T"]},
+    ),
+    "mitsuba, moments": (
+        [*"RGBA", *rgb("aov.albedo"), *xyz("aov.nn"), *rgb("m2_aov.albedo"), *xyz("m2_aov.nn")],
+        {"color": [*"RGB"], "albedo": rgb("aov.albedo"), "normal": xyz("aov.nn"), "alpha": ["A"]},
+    ),
+    "components in lower case": (["Ci.r", "Ci.g", "Ci.b"], {"color": ["Ci.r", "Ci.g", "Ci.b"]}),
+    "grey": (["Y"], {"color": ["Y", "Y", "Y"]}),
+}
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_layers_of_renderers_are_recognised(tmp_path: Path, renderer: str, dtype: type) -> None:
+    names, expected = RENDERERS[renderer]
+    channels = save(tmp_path / "a.exr", *names, dtype=dtype)
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert {name for name, _ in buffers.quantities()} == expected.keys() - {"alpha"}
+    for quantity, taken in expected.items():
+        if quantity != "alpha":
+            assert holds(getattr(buffers, quantity), channels, *taken), quantity
+            assert getattr(buffers, quantity).mean.dtype == np.float32
+    alpha = expected.get("alpha")
+    assert (buffers.alpha is None) == (alpha is None)
+    assert alpha is None or np.array_equal(buffers.alpha[..., 0], channels[alpha[0]])
+    assert buffers.color.variance is None
+
+
+def test_variance_of_pbrt_is_that_of_one_sample(tmp_path: Path) -> None:
+    names = [*"RGB", *rgb("Variance"), *rgb("RelativeVariance")]
+    channels = save(tmp_path / "a.exr", *names, samplesPerPixel=16)
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert buffers.spp == 16
+    assert np.array_equal(buffers.color.variance[..., 1], channels["Variance.G"] / np.float32(16))
+
+
+def test_variance_of_unknown_scale_is_taken_only_when_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    channels = save(tmp_path / "a.exr", *"RGB", *rgb("variance"))
+    with caplog.at_level(logging.INFO):
+        assert read_buffers(tmp_path / "a.exr").color.variance is None
+    assert "--map colorVariance=" in caplog.text
+    buffers = read_buffers(tmp_path / "a.exr", {"colorVariance": "variance"})
+    assert np.array_equal(buffers.color.variance[..., 2], channels["variance.B"])
+
+
+def test_halves_and_variances_stand_beside_their_layer(tmp_path: Path) -> None:
+    ours = [
+        *rgb("color"),
+        *rgb("colorA"),
+        *rgb("colorB"),
+        *rgb("colorVariance"),
+        "depth.Y",
+        "depthVariance.Y",
+    ]
+    channels = save(tmp_path / "a.exr", *ours)
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert [name for name, _ in buffers.color.planes()] == ["mean", "half_a", "half_b", "variance"]
+    assert np.array_equal(buffers.color.half_b[..., 0], channels["colorB.R"])
+    assert [name for name, _ in buffers.depth.planes()] == ["mean", "variance"]
+    channels = save(tmp_path / "b.exr", *rgb("L.Combined"), *rgb("L.Combined_A"), *rgb("L.Combined_B"))
+    assert np.array_equal(read_buffers(tmp_path / "b.exr").color.half_a[..., 0], channels["L.Combined_A.R"])
+
+
+def test_what_was_taken_for_what_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save(tmp_path / "a.exr", *"RGBA", *rgb("albedo"), *xyz("P"), "id")
+    with caplog.at_level(logging.INFO):
+        read_buffers(tmp_path / "a.exr")
+    lines = [record.getMessage() for record in caplog.records]
+    assert "color: mean RGB" in lines
+    assert "albedo: mean albedo.RGB" in lines
+    assert "alpha: A" in lines
+    assert "ignored: id, P" in lines
+
+
+def test_map_settles_the_rest(tmp_path: Path) -> None:
+    channels = save(
+        tmp_path / "a.exr", *rgb("main"), *rgb("odd"), "nx", "ny", "nz", "dist", *rgb("albedo"), "m"
+    )
+    mapping = {
+        "color": "main",
+        "colorA": "odd",
+        "normal": "nx,ny,nz",
+        "depth": "dist",
+        "albedo": "none",
+        "alpha": "m",
+    }
+    buffers = read_buffers(tmp_path / "a.exr", mapping)
+    assert holds(buffers.color, channels, *rgb("main"))
+    assert holds(buffers.normal, channels, "nx", "ny", "nz")
+    assert holds(buffers.depth, channels, "dist")
+    assert np.array_equal(buffers.color.half_a[..., 0], channels["odd.R"])
+    assert np.array_equal(buffers.alpha[..., 0], channels["m"])
+    assert buffers.albedo is None
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"colour": "RGBA"}, "expected one of color, colorA"),
+        ({"color": "beauty"}, "no such layer or channel; there are"),
+        ({"color": "two"}, "name the channels"),
+        ({"color": "none"}, "no colour"),
+        ({"depth": "odd"}, "expected 1 channels"),
+        ({"normal": "Z"}, "expected 3 channels"),
+        ({"albedoA": "odd"}, "no mean"),
+    ],
+)
+def test_a_wrong_map_is_refused(tmp_path: Path, mapping: dict[str, str], message: str) -> None:
+    save(tmp_path / "a.exr", *"RGB", *rgb("odd"), "two.u", "two.v", "Z")
+    with pytest.raises(InputError, match=message):
+        read_buffers(tmp_path / "a.exr", mapping)
+
+
+def test_parts_are_layers(tmp_path: Path) -> None:
+    color = {name: pixels(i) for i, name in enumerate("RGBA")}
+    normal = {name: pixels(i + 9, np.float16) for i, name in enumerate("XYZ")}
+    depth = {"Z": pixels(20)}
+    for first in ("rgba", "beauty", "whatever"):
+        save_parts(
+            tmp_path / "a.exr", **{first: color, "normal": normal, "depth": depth, "id": {"id": pixels(3)}}
+        )
+        buffers = read_buffers(tmp_path / "a.exr")
+        assert holds(buffers.color, color, *"RGB")
+        assert holds(buffers.normal, normal, *"XYZ")
+        assert holds(buffers.depth, depth, "Z")
+        assert np.array_equal(buffers.alpha[..., 0], color["A"])
+    save_parts(tmp_path / "a.exr", albedo={n: pixels(i) for i, n in enumerate("RGB")}, main=color)
+    with pytest.raises(InputError, match=r"no colour.*albedo, main.*--map color=LAYER"):
+        read_buffers(tmp_path / "a.exr")
+    assert holds(read_buffers(tmp_path / "a.exr", {"color": "main"}).color, color, *"RGB")
+
+
+def test_tiles_and_mipmaps(tmp_path: Path) -> None:
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 4
+    names = [*"RGB", *rgb("albedo")]
+    channels = save(tmp_path / "a.exr", *names, type=OpenEXR.tiledimage, tiles=tiles)
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert holds(buffers.color, channels, *"RGB")
+    assert holds(buffers.albedo, channels, *rgb("albedo"))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (33, 1), (17, 13)])
+@pytest.mark.parametrize("suffix", [".exr", ".pfm", ".hdr"])
+def test_sizes_and_formats_of_single_images(tmp_path: Path, size: tuple[int, int], suffix: str) -> None:
+    image = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".pfm":  # as Tungsten writes it: rows bottom up
+        path.write_bytes(b"PF\n%d %d\n-1\n" % (size[1], size[0]) + image[::-1].tobytes())
+    else:
+        output = oiio.ImageOutput.create(str(path))
+        assert output.open(str(path), oiio.ImageSpec(size[1], size[0], 3, "float"))
+        assert output.write_image(image)
+        output.close()
+    tolerance = 1 / 128 if suffix == ".hdr" else 0  # RGBE has 8 bits of mantissa
+    assert np.abs(read_buffers(path).color.mean - image).max() <= tolerance
+    assert np.array_equal(read_image(path), read_buffers(path).color.mean)
+
+
+def test_nan_and_infinity_are_left_for_the_mender(tmp_path: Path) -> None:
+    image = np.full((2, 3), np.nan, np.float16)
+    image[0, 0], image[0, 1] = np.inf, -np.inf
+    save_channels(tmp_path / "a.exr", dict.fromkeys([*"RGB", *rgb("depth")], image))
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert np.array_equal(buffers.color.mean[..., 1], image, equal_nan=True)
+    assert np.array_equal(buffers.depth.mean[..., 0], image, equal_nan=True)  # three equal channels
+
+
+# Folders and scenes
+
+
+def save_folder(
+    folder: Path, suffix: str = ".exr", keys: tuple[str, ...] = ("color", "normal", "depth")
+) -> None:
+    for key in keys:
+        names = "Y" if key.startswith(("depth", "visibility")) else "RGB"
+        if suffix == ".exr":
+            save(folder / f"{key}.exr", *names, dtype=np.float16)
+        else:
+            data = np.random.default_rng(len(key)).random((HEIGHT, WIDTH, len(names)), dtype=np.float32)
+            ident = b"PF" if len(names) == 3 else b"Pf"
+            (folder / f"{key}.pfm").write_bytes(ident + b"\n%d %d\n-1\n" % (WIDTH, HEIGHT) + data.tobytes())
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".pfm"])
+def test_a_folder_of_tungsten(tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture) -> None:
+    keys = tuple(
+        quantity + plane
+        for quantity in ("color", "albedo", "normal", "depth", "visibility")
+        for plane in ("", "A", "B", "Variance")
+    )
+    save_folder(tmp_path, suffix, (*keys, "nfor"))
+    (tmp_path / "notes.txt").write_text("not an image")
+    with caplog.at_level(logging.INFO):
+        buffers = read_buffers(tmp_path)
+    assert [name for name, _ in buffers.quantities()] == ["color", "albedo", "normal", "depth", "visibility"]
+    for _, buffer in buffers.quantities():
+        assert len(list(buffer.planes())) == 4
+    assert f"ignored: nfor{suffix}" in caplog.text
+
+
+def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save_folder(tmp_path)
+    save_folder(tmp_path, ".pfm", ("color",))
+    channels = save(tmp_path / "beauty.exr", *"RGB", dtype=np.float16)
+    with caplog.at_level(logging.INFO):
+        assert holds(
+            read_buffers(tmp_path).color, save(tmp_path / "color.exr", *"RGB", dtype=np.float16), *"RGB"
+        )
+    assert "ignored: beauty.exr, color.pfm" in caplog.text
+    mapped = read_buffers(tmp_path, {"color": "beauty", "normal": "none", "albedo": "normal.exr"})
+    assert holds(mapped.color, channels, *"RGB")
+    assert mapped.normal is None
+    assert mapped.albedo is not None
+    with pytest.raises(InputError, match=r"there are beauty\.exr"):
+        read_buffers(tmp_path, {"color": "missing.exr"})
+
+
+def test_a_scene_names_its_buffers(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("c", "cA", "cB", "cVariance", "n", "nVariance"):
+        save(tmp_path / "out" / f"{name}.exr", *"RGB")
+    save(tmp_path / "out" / "d.exr", "Y")
+    scene = {
+        "renderer": {
+            "output_directory": "out",
+            "output_buffers": [
+                {"type": "depth", "hdr_output_file": "d.exr"},
+                {"type": "normal", "hdr_output_file": "n.exr", "sample_variance": True},
+                {
+                    "type": "color",
+                    "hdr_output_file": "c.exr",
+                    "two_buffer_variance": True,
+                    "sample_variance": True,
+                },
+                {"type": "albedo", "ldr_output_file": "albedo.png"},
+            ],
+        }
+    }
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(scene))
+    buffers = read_buffers(path)
+    assert [name for name, _ in buffers.color.planes()] == ["mean", "half_a", "half_b", "variance"]
+    assert [name for name, _ in buffers.normal.planes()] == ["mean", "variance"]
+    assert buffers.depth is not None
+    assert buffers.albedo is None
+    (tmp_path / "out" / "cB.exr").unlink()
+    with pytest.raises(InputError, match=r"cB.exr, which does not exist; render the scene first"):
+        read_buffers(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{\n  broken", "line 2 is not JSON"),
+        ("[]", "renderer.output_buffers"),
+        ('{"renderer": {"output_buffers": [{"hdr_output_file": "c.exr"}]}}', "renderer.output_buffers"),
+        ('{"renderer": {"output_buffers": [{"type": [], "hdr_output_file": 3}]}}', "renderer.output_buffers"),
+        ('{"renderer": {"output_buffers": 7}}', "renderer.output_buffers"),
+        ('{"renderer": {}}', "saves no colour"),
+        ("{}", "saves no colour"),
+        ('{"renderer": {"hdr_output_file": "render.exr"}}', "render the scene first"),
+        ("[" * 100_000, "renderer.output_buffers"),
+    ],
+)
+def test_a_broken_scene_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "scene.json").write_text(text)
+    refused(tmp_path / "scene.json", message)
+
+
+# What cannot be used
+
+
+def refused(path: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_buffers(path)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert path.name in line
+    assert ";" in line, "the message ends in what to do"
+
+
+def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
+    refused(tmp_path / "none.exr", "no such file")
+    refused(tmp_path / "none.json", "cannot be read")
+    refused(tmp_path, "found no image.*--map color=FILE")
+    for suffix in (".exr", ".pfm", ".hdr"):
+        (tmp_path / f"text{suffix}").write_text("hello world " * 100)
+        refused(tmp_path / f"text{suffix}", "no readable image")
+        (tmp_path / f"empty{suffix}").touch()
+        refused(tmp_path / f"empty{suffix}", "no readable image")
+    (tmp_path / "a.png").touch()
+    refused(tmp_path / "a.png", "linear radiance")
+
+
+def test_every_truncation_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    save(tmp_path / "whole.exr", *"RGB", *rgb("albedo"))
+    whole = (tmp_path / "whole.exr").read_bytes()
+    for length in range(0, len(whole), 7):
+        (tmp_path / "cut.exr").write_bytes(whole[:length])
+        refused(tmp_path / "cut.exr", "no readable image|truncated|damaged")
+    assert capfd.readouterr() == ("", ""), "the libraries must not print"
+
+
+def test_a_header_that_claims_too_much_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "a.exr", *"RGB")
+    data = bytearray((tmp_path / "a.exr").read_bytes())
+    at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    for corner in (10**9 - 1, 10**5, 20_000, 2**31 - 1, -9):
+        data[at : at + 16] = struct.pack("<4i", 0, 0, corner, corner)
+        (tmp_path / "a.exr").write_bytes(data)
+        refused(tmp_path / "a.exr", "no readable image|pixels")
+    (tmp_path / "a.pfm").write_bytes(b"PF\n60000 60000\n-1\n" + bytes(100))
+    refused(tmp_path / "a.pfm", "no readable image|pixels")
+    (tmp_path / "a.hdr").write_bytes(
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n" + bytes(100)
+    )
+    refused(tmp_path / "a.hdr", "no readable image|pixels")
+
+
+def test_deep_pixels_are_refused(tmp_path: Path) -> None:
+    spec = oiio.ImageSpec(2, 2, 1, "float")
+    spec.deep, spec.channelnames = True, ("Z",)
+    deep = oiio.DeepData()
+    deep.init(spec)
+    output = oiio.ImageOutput.create(str(tmp_path / "deep.exr"))
+    assert output.open(str(tmp_path / "deep.exr"), spec)
+    assert output.write_deep_image(deep)
+    output.close()
+    refused(tmp_path / "deep.exr", "flatten")
+
+
+def test_sizes_must_agree(tmp_path: Path) -> None:
+    save_folder(tmp_path)
+    save_channels(tmp_path / "normal.exr", {name: pixels(0, height=4) for name in "RGB"})
+    with pytest.raises(InputError, match=r"normal.exr: expected 7 x 5 .* got 7 x 4 .*one size"):
+        read_buffers(tmp_path)
+    window = np.array([2, 0], "i"), np.array([8, 4], "i")
+    save(tmp_path / "normal.exr", *"RGB", dataWindow=window)
+    with pytest.raises(InputError, match=r"got 7 x 5 pixels from \(2, 0\)"):
+        read_buffers(tmp_path)
+    save_parts(tmp_path / "p.exr", rgba={n: pixels(0) for n in "RGB"}, depth={"Z": pixels(0, width=9)})
+    refused(tmp_path / "p.exr", "expected 7 x 5")
+
+
+def test_without_colour(tmp_path: Path) -> None:
+    save(tmp_path / "a.exr", *rgb("albedo"), "Z")
+    refused(tmp_path / "a.exr", "no colour.*found Z, albedo; use --map color=LAYER")
+    save(tmp_path / "b.exr", "R", "G")
+    refused(tmp_path / "b.exr", "no colour")
+    with pytest.raises(InputError, match="R, G, B or Y"):
+        read_image(tmp_path / "a.exr")
+
+
+def test_depth_of_three_different_channels(tmp_path: Path) -> None:
+    save(tmp_path / "a.exr", *"RGB", *rgb("depth"))
+    refused(tmp_path / "a.exr", "depth: expected 1 channels")
+    assert read_buffers(tmp_path / "a.exr", {"depth": "depth.R"}).depth is not None
+
+
+NAME = st.text(string.ascii_letters + string.digits + "._- äß", min_size=1, max_size=12)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=st.lists(NAME, min_size=1, max_size=12, unique=True), known=st.booleans())
+def test_any_mix_of_channel_names_reads_or_is_refused(tmp_path: Path, names: list[str], known: bool) -> None:
+    names = list(dict.fromkeys([*names, *([*"RGB"] if known else [])]))
+    channels = {name: pixels(index, np.float16, 1, 2) for index, name in enumerate(names)}
+    save_channels(tmp_path / "a.exr", channels)
+    try:
+        buffers = read_buffers(tmp_path / "a.exr")
+    except InputError:
+        assume(False)
+    assert isinstance(buffers, RenderBuffers)
+    assert buffers.source.parts[0].channels.keys() == channels.keys()
+    for name, channel in buffers.source.parts[0].channels.items():
+        assert channel.tobytes() == channels[name].tobytes()
+        assert channel.dtype == np.float16

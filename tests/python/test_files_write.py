@@ -1,0 +1,404 @@
+"""Writing results: bit-exact pass-through, reading back, and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import string
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from tungsten_dip.buffers import (
+    Buffer,
+    RenderBuffers,
+    check_writable,
+    read_buffers,
+    read_image,
+    replacing,
+    write_denoised,
+    write_image,
+    write_tungsten_folder,
+)
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitResult, FitSettings
+
+Channels = dict[str, np.ndarray]
+
+
+def noise(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+
+
+def result_for(buffers: RenderBuffers, scale: float = 0.5, error: bool = True) -> FitResult:
+    shape = buffers.color.mean.shape
+    return FitResult(
+        color=scale * noise(shape, 77),
+        settings=FitSettings(seed=12, preset="draft"),
+        seconds=1.5,
+        iterations=40,
+        error=noise((*shape[:2], 1), 78) if error else None,
+        estimated_relmse=0.25 if error else None,
+    )
+
+
+def save(path: Path, parts: dict[str, Channels], **header: object) -> None:
+    encoded = [
+        OpenEXR.Part(
+            {"type": OpenEXR.scanlineimage, **header}, {n: c.copy() for n, c in channels.items()}, name
+        )
+        for name, channels in parts.items()
+    ]
+    OpenEXR.File(encoded).write(str(path))
+
+
+def load(path: Path) -> list[tuple[str, Channels, dict[str, object]]]:
+    """Read with OpenEXR alone, independent of our reader."""
+    parts = OpenEXR.File(str(path), separate_channels=True).parts
+    return [(p.name(), {n: c.pixels for n, c in p.channels.items()}, dict(p.header)) for p in parts]
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def assert_same(a: RenderBuffers, b: RenderBuffers) -> None:
+    assert [name for name, _ in a.quantities()] == [name for name, _ in b.quantities()]
+    for (name, x), (_, y) in zip(a.quantities(), b.quantities(), strict=True):
+        assert [plane for plane, _ in x.planes()] == [plane for plane, _ in y.planes()]
+        for (plane, p), (_, q) in zip(x.planes(), y.planes(), strict=True):
+            assert same_bits(p, q), (name, plane)
+    assert (a.alpha is None) == (b.alpha is None)
+    assert a.alpha is None or same_bits(a.alpha, b.alpha)
+    if isinstance(a.spp, np.ndarray):
+        assert same_bits(a.spp, b.spp)
+    else:
+        assert a.spp == b.spp
+    assert a.attributes.keys() == b.attributes.keys()
+
+
+HALF_WITH_NAN_BITS = np.array([[0x7C01, 0x7E55, 0xFE00], [0x7C00, 0x8000, 0x0001]], np.uint16).view(
+    np.float16
+)
+"""Signalling and quiet NaN, infinity, -0 and a subnormal: nothing that survives a conversion by chance."""
+
+
+def mixed_channels() -> Channels:
+    return {
+        **dict.fromkeys("RGBA", HALF_WITH_NAN_BITS),
+        **{f"albedo.{name}": noise((2, 3), index) for index, name in enumerate("RGB")},
+        "object.id": np.array([[0, 2**32 - 1, 2**31], [3, 4, 5]], np.uint32),
+        "P.X": HALF_WITH_NAN_BITS,
+        "error.Y": noise((2, 3), 9),
+    }
+
+
+def test_everything_of_the_input_passes_through_bit_for_bit(tmp_path: Path) -> None:
+    channels = mixed_channels()
+    window = np.array([-4, 2], "i"), np.array([-2, 3], "i")
+    display = np.array([0, 0], "i"), np.array([9, 9], "i")
+    attributes = {
+        "owner": "somebody",
+        "worldToCamera": np.eye(4, dtype="f"),
+        "exposure": 2.5,
+        "samplesPerPixel": 8,
+        "views": ["a", "b"],
+        "pixelAspectRatio": 1.5,
+    }
+    save(tmp_path / "in.exr", {"": channels}, dataWindow=window, displayWindow=display, **attributes)
+    buffers = read_buffers(tmp_path / "in.exr")
+    result = result_for(buffers)
+    write_denoised(tmp_path / "out.exr", result, buffers)
+    [(_, written, header)] = load(tmp_path / "out.exr")
+    for index, name in enumerate("RGB"):
+        assert same_bits(written[name], result.color[..., index].copy())
+    assert same_bits(written["error.Y"], result.error[..., 0].copy())
+    for name, channel in channels.items():
+        moved = f"noisy.{name}" if name in {*"RGB", "error.Y"} else name
+        assert same_bits(written[moved], channel), name
+    assert written.keys() == {*"RGBA", "noisy.R", "noisy.G", "noisy.B", "noisy.error.Y", "error.Y"} | (
+        channels.keys() - {*"RGBA", "error.Y"}
+    )
+    assert np.array_equal(header["dataWindow"], window)
+    assert np.array_equal(header["displayWindow"], display)
+    for name, value in attributes.items():
+        assert np.array_equal(header[name], value), name
+    assert header["tungsten_dip/seed"] == "12"
+    assert header["tungsten_dip/seconds"] == 1.5
+    assert header["tungsten_dip/iterations"] == 40
+    assert header["tungsten_dip/estimated_relmse"] == 0.25
+    assert json.loads(header["tungsten_dip/settings"])["preset"] == "draft"
+    assert header["tungsten_dip/version"]
+
+    again = read_buffers(tmp_path / "out.exr")
+    assert_same(buffers, again)
+    assert np.array_equal(read_image(tmp_path / "out.exr"), result.color)
+    write_denoised(tmp_path / "out.exr", result, again)  # onto its own input
+    assert load(tmp_path / "out.exr")[0][1].keys() == written.keys()
+    assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+
+
+def test_parts_pass_through(tmp_path: Path) -> None:
+    parts = {
+        "rgba": dict.fromkeys("RGBA", HALF_WITH_NAN_BITS),
+        "N": {name: noise((2, 3), index) for index, name in enumerate("XYZ")},
+        "id": {"id": np.arange(6, dtype=np.uint32).reshape(2, 3)},
+    }
+    save(tmp_path / "in.exr", parts, note="kept")
+    buffers = read_buffers(tmp_path / "in.exr")
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    for _ in range(2):
+        first, *others = load(tmp_path / "out.exr")
+        assert first[1].keys() == {*"RGBA", "error.Y"}
+        assert same_bits(first[1]["A"], HALF_WITH_NAN_BITS.astype(np.float32))
+        assert [name for name, _, _ in others] == list(parts)
+        for name, channels, header in others:
+            assert channels.keys() == parts[name].keys()
+            assert all(same_bits(channels[key], parts[name][key]) for key in channels)
+            assert header["note"] == "kept"
+        again = read_buffers(tmp_path / "out.exr")
+        assert_same(buffers, again)
+        write_denoised(tmp_path / "out.exr", result_for(again, error=True), again)
+
+
+def test_the_map_is_remembered(tmp_path: Path) -> None:
+    names = [*"RGB", "main.R", "main.G", "main.B", "nx", "ny", "nz"]
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})
+    buffers = read_buffers(tmp_path / "in.exr", {"color": "main", "normal": "nx,ny,nz"})
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+    other = read_buffers(tmp_path / "out.exr", {"color": "R,G,B"})
+    assert same_bits(other.color.mean, read_buffers(tmp_path / "in.exr").color.mean)
+
+
+def test_a_folder_travels_in_half(tmp_path: Path) -> None:
+    for key, names in (("color", "RGB"), ("colorVariance", "RGB"), ("depth", "Y")):
+        save(tmp_path / f"{key}.exr", {"": dict.fromkeys(names, HALF_WITH_NAN_BITS)})
+    buffers = read_buffers(tmp_path)
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, written, _)] = load(tmp_path / "out.exr")
+    assert {"color.R", "colorVariance.B", "depth.Y"} <= written.keys()
+    assert all(
+        same_bits(written[name], HALF_WITH_NAN_BITS) for name in ("color.R", "colorVariance.B", "depth.Y")
+    )
+    assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 8), (13, 7)])
+@pytest.mark.parametrize("spp", [None, 16.0, "varies"])
+def test_buffers_of_a_host_become_layers(
+    tmp_path: Path, make_render: Callable, size: tuple[int, int], spp: object
+) -> None:
+    per_pixel = noise((*size, 1)) if spp == "varies" else spp
+    buffers = make_render(height=size[0], width=size[1]).buffers
+    buffers = RenderBuffers(
+        **dict(buffers.quantities()), spp=per_pixel, alpha=noise((*size, 1), 3), attributes={"host": "a test"}
+    )
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, written, header)] = load(tmp_path / "out.exr")
+    assert {*"RGBA", "color.R", "colorA.R", "normal.X", "depth.Y", "error.Y"} <= written.keys()
+    assert header["host"] == "a test"
+    assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+    write_tungsten_folder(tmp_path / "folder", buffers)
+    assert (tmp_path / "folder" / "colorVariance.exr").is_file()
+    assert_same(buffers, read_buffers(tmp_path / "folder"))
+
+
+def test_a_folder_of_another_render_is_not_mixed_in(tmp_path: Path, make_render: Callable) -> None:
+    buffers = make_render(height=3, width=4).buffers
+    write_tungsten_folder(tmp_path, buffers)
+    write_tungsten_folder(tmp_path, buffers)
+    with pytest.raises(InputError, match=r"holds .* of another render; remove it"):
+        write_tungsten_folder(tmp_path, RenderBuffers(buffers.color))
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_tungsten_folder(tmp_path / "file", buffers)
+
+
+def test_half_never_turns_into_infinity(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    buffers = RenderBuffers(Buffer(noise((2, 3, 3))))
+    fits, bright = result_for(buffers), result_for(buffers, scale=1e6)
+    fits.color[0, 0] = np.inf, 65504, np.nan
+    write_denoised(tmp_path / "a.exr", fits, buffers, half=True)
+    channels = load(tmp_path / "a.exr")[0][1]
+    assert channels["R"].dtype == channels["error.Y"].dtype == np.float16
+    assert channels["G"][0, 0] == 65504
+    assert channels["color.R"].dtype == np.float32
+    assert not caplog.text
+    write_denoised(tmp_path / "a.exr", bright, buffers, half=True)
+    channels = load(tmp_path / "a.exr")[0][1]
+    assert same_bits(channels["R"], bright.color[..., 0].copy())
+    assert channels["error.Y"].dtype == np.float16
+    assert "65504" in caplog.text
+
+
+def test_attributes_that_exr_cannot_hold_do_not_cost_the_result(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    attributes = {
+        "good": "yes",
+        "rational": OpenEXR.Rational(1, 2),
+        "nested": {"a": 1},
+        "type": 3,
+        "channels": "x",
+    }
+    buffers = RenderBuffers(Buffer(noise((2, 3, 3))), attributes=attributes)
+    with caplog.at_level(logging.WARNING):
+        write_denoised(tmp_path / "a.exr", result_for(buffers, error=False), buffers)
+    header = load(tmp_path / "a.exr")[0][2]
+    assert header["good"] == "yes"
+    assert "error.Y" not in load(tmp_path / "a.exr")[0][1]
+    assert "rational" in caplog.text
+    assert "nested" in caplog.text
+
+
+NAME = st.sampled_from(
+    ["R", "G", "B", "A", "Y", "Z", "noisy.R", "noisy.G", "noisy_.B", "error.Y", "error", "N.X"]
+)
+OTHER = st.text(string.ascii_letters + string.digits + "._ ", min_size=1, max_size=8)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=st.lists(NAME | OTHER, max_size=10, unique=True), types=st.randoms(use_true_random=False))
+def test_any_channel_names_survive(tmp_path: Path, names: list[str], types: object) -> None:
+    names = list(dict.fromkeys([*names, "beauty.R", "beauty.G", "beauty.B"]))
+    dtypes = [types.choice([np.float16, np.float32, np.uint32]) for _ in names]
+    channels = {
+        name: (1000 * noise((1, 2), index)).astype(dtype)
+        for index, (name, dtype) in enumerate(zip(names, dtypes, strict=True))
+    }
+    save(tmp_path / "in.exr", {"": channels})
+    try:
+        buffers = read_buffers(tmp_path / "in.exr")
+    except InputError:  # such as a depth of three different channels
+        assume(False)
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    again = read_buffers(tmp_path / "out.exr")
+    assert_same(buffers, again)
+    restored = again.source.parts[0].channels
+    assert restored.keys() == channels.keys()
+    assert all(same_bits(restored[name], channels[name]) for name in channels)
+
+
+# Single pictures
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 8), (9, 1)])
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("suffix", [".exr", ".pfm", ".hdr", ".png"])
+def test_single_pictures(tmp_path: Path, size: tuple[int, int], count: int, suffix: str) -> None:
+    image = noise((*size, count))
+    write_image(tmp_path / f"a{suffix}", image)
+    if suffix == ".png":
+        stored = oiio.ImageInput.open(str(tmp_path / "a.png")).read_image("float")
+    else:
+        stored = read_image(tmp_path / f"a{suffix}")
+    tolerance = {".png": 0.5 / 255 + 1e-6, ".hdr": 1 / 128}.get(suffix, 0)
+    assert np.abs(stored - image).max() <= tolerance
+
+
+def test_png_clips_and_rounds(tmp_path: Path) -> None:
+    values = np.array([-1, 0, 0.499 / 255, 0.501 / 255, 1, 7], np.float32)
+    write_image(tmp_path / "a.png", values.reshape(1, 6, 1))
+    stored = oiio.ImageInput.open(str(tmp_path / "a.png")).read_image("uint8")
+    assert stored.ravel().tolist() == [0, 0, 0, 1, 255, 255]
+
+
+def test_pfm_is_stored_bottom_up(tmp_path: Path) -> None:
+    image = noise((3, 2, 3))
+    write_image(tmp_path / "a.pfm", image)
+    data = (tmp_path / "a.pfm").read_bytes()[-image.nbytes :]
+    assert np.array_equal(np.frombuffer(data, "<f4").reshape(image.shape), image[::-1])
+
+
+# Whole or not at all
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".pfm", ".hdr", ".png"])
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, suffix: str) -> None:
+    """A child process may write files of at most 3000 bytes: writing fails there as on a full disk."""
+    old = tmp_path / f"old{suffix}"
+    old.write_bytes(b"old")
+    script = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from tungsten_dip.buffers import write_image
+from tungsten_dip.errors import InputError
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+image = np.random.default_rng(0).random((64, 64, 3), dtype=np.float32)
+refused = 0
+for name in sys.argv[1:]:
+    try:
+        write_image(name, image)
+    except InputError as error:
+        assert name in str(error) and "\\n" not in str(error), error
+        refused += 1
+sys.exit(refused)
+"""
+    names = [str(old), str(tmp_path / f"new{suffix}")]
+    child = subprocess.run(
+        [sys.executable, "-c", script, *names], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (child.returncode, child.stdout, child.stderr) == (2, "", "")
+    assert [file.name for file in tmp_path.iterdir()] == [old.name]
+    assert old.read_bytes() == b"old"
+
+
+def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail(failure: type[BaseException]) -> None:
+        with replacing(path) as temporary:
+            assert temporary.suffix == ".txt"
+            temporary.write_text("half")
+            raise failure
+
+    for failure in (RuntimeError, KeyboardInterrupt):
+        with pytest.raises(failure):
+            fail(failure)
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["new"]
+
+
+def test_a_link_stays_a_link_and_the_umask_holds(tmp_path: Path) -> None:
+    (tmp_path / "link.exr").symlink_to(tmp_path / "target.exr")
+    write_image(tmp_path / "link.exr", noise((2, 2, 3)))
+    assert (tmp_path / "link.exr").is_symlink()
+    umask = os.umask(0)
+    os.umask(umask)
+    assert (tmp_path / "target.exr").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_what_cannot_be_written_is_known_before(tmp_path: Path) -> None:
+    check_writable(tmp_path / "a.exr")
+    check_writable(tmp_path / "a.EXR")
+    check_writable(tmp_path / "a.html", (".html",))
+    (tmp_path / "folder.exr").mkdir()
+    (tmp_path / "file").touch()
+    before = sorted(tmp_path.iterdir())
+    for path, message in (
+        (tmp_path / "a.png", r"ends in \.exr"),
+        (tmp_path / "none" / "a.exr", "cannot be written"),
+        (tmp_path / "file" / "a.exr", "cannot be written"),
+        (tmp_path / "folder.exr", "folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_writable(path)
+    assert sorted(tmp_path.iterdir()) == before
+    for suffix in (".exr", ".png", ".gif"):
+        with pytest.raises(InputError, match=r"cannot be written|ends in"):
+            write_image(tmp_path / "none" / f"a{suffix}", noise((2, 2, 3)))
