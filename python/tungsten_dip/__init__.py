@@ -13,28 +13,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, write_denoised
+    from tungsten_dip.buffers.model import Buffer, RenderBuffers
+    from tungsten_dip.buffers.read import read_buffers
+    from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
-    from tungsten_dip.fit import FitResult, FitSettings, denoise
+    from tungsten_dip.fit import denoise
+    from tungsten_dip.fit.settings import FitResult, FitSettings
     from tungsten_dip.hosts import render
-    from tungsten_dip.report import Comparison, compare
-    from tungsten_dip.scene import load_scene
+    from tungsten_dip.report.metrics import Comparison, compare
+    from tungsten_dip.scene.parse import load_scene
 
     __version__: str
 
 _MODULE_BY_NAME = {
-    "Buffer": "buffers",
-    "Comparison": "report",
-    "FitResult": "fit",
-    "FitSettings": "fit",
+    "Buffer": "buffers.model",
+    "Comparison": "report.metrics",
+    "FitResult": "fit.settings",
+    "FitSettings": "fit.settings",
     "InputError": "errors",
-    "RenderBuffers": "buffers",
-    "compare": "report",
+    "RenderBuffers": "buffers.model",
+    "compare": "report.metrics",
     "denoise": "fit",
-    "load_scene": "scene",
-    "read_buffers": "buffers",
+    "load_scene": "scene.parse",
+    "read_buffers": "buffers.read",
     "render": "hosts",
-    "write_denoised": "buffers",
+    "write_denoised": "buffers.write",
 }
 
 __all__ = [

@@ -78,7 +78,7 @@ def run(command: str, body: Callable[[], None]) -> int:
 
 @contextmanager
 def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Keep stdout for one JSON object: within the block all else written there, by libraries too, goes to stderr.
+    """Keep stdout for one JSON object: all else written there in the block, by libraries too, goes to stderr.
 
     Yields the function that prints the object. Numbers that JSON has no name for (NaN, Inf) become null.
     """
@@ -102,7 +102,7 @@ def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
-    """Yield a progress callback: a bar with the time left, or a line now and then where there is no terminal."""
+    """Yield a progress callback: a bar with the time left, or a line now and then off a terminal."""
     if sys.stderr.isatty():
         with tqdm(
             total=1.0,
@@ -135,12 +135,32 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
 def duration(text: str, default_unit: str = "s") -> float:
     """Return the seconds of ``90s``, ``5m``, ``1.5h`` or ``1h30m``; a bare number has the default unit.
 
-    Raises InputError if the text is none of these.
+    Raises argparse.ArgumentTypeError if the text is none of these.
     """
-    parts = re.findall(r"\s*(\d+\.?\d*|\.\d+)\s*(ms|s|m|h|d)?", text)
-    if not parts or not re.fullmatch(r"(\s*(\d+\.?\d*|\.\d+)\s*(ms|s|m|h|d)?)+\s*", text):
-        raise InputError(f"expected a duration such as 90s, 5m or 1.5h, got '{text}'")
+    compact = "".join(text.split()).lower()
+    parts = re.findall(r"(\d+\.?\d*|\.\d+)(ms|[smhd]|$)", compact)
+    if not parts or "".join(number + unit for number, unit in parts) != compact:
+        raise argparse.ArgumentTypeError(f"expected a duration such as 90s, 5m or 1.5h, got '{text}'")
     return math.fsum(float(number) * SECONDS_BY_UNIT[unit or default_unit] for number, unit in parts)
+
+
+def minutes(text: str) -> float:
+    """Return the seconds of a duration as Tungsten reads it: a bare number means minutes."""
+    return duration(text, default_unit="m")
+
+
+@contextmanager
+def remarks_from_log() -> Iterator[list[str]]:
+    """Yield a list of what the library logs within the block, for the report."""
+    remarks: list[str] = []
+    handler = logging.Handler(logging.INFO)
+    handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("tungsten_dip")
+    logger.addHandler(handler)
+    try:
+        yield remarks
+    finally:
+        logger.removeHandler(handler)
 
 
 class _StderrHandler(logging.Handler):

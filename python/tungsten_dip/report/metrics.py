@@ -24,11 +24,11 @@ SSIM_WINDOW = 7
 class Comparison:
     """Distances of an image from its reference.
 
-    ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2); ``relmse``
-    and ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None where a side is
-    under 7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of exposures.
-    ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is the mean
-    radiance over the reference's, None where that is black.
+    ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2);
+    ``relmse`` and ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None
+    where a side is under 7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of
+    exposures. ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is
+    the mean radiance over the reference's, None where that is black.
     """
 
     psnr: float
@@ -43,8 +43,8 @@ class Comparison:
 def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     """Compare two images of linear radiance, shape (height, width, 3).
 
-    PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is Wang et
-    al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP Andersson et al. 2021, both at 67 pixels per degree.
+    PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is
+    Wang et al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP theirs of 2021, at 67 pixels per degree.
 
     Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference
     is not finite.

@@ -1,0 +1,76 @@
+"""What both commands do to denoise: their settings as options, the fit with its progress, the report."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+from tungsten_dip.buffers import RenderBuffers, replacing, sanitize
+from tungsten_dip.cli.console import duration, progress_on_stderr
+from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
+from tungsten_dip.report.page import report_page
+
+log = logging.getLogger(__name__)
+
+FIT_OPTIONS = ("preset", "time_budget_s", "target_error", "device")
+"""The settings that both commands leave to the user."""
+
+
+def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
+    """Add the options of a fit that both commands have, as ``--{prefix}preset`` and so on."""
+    add = parser.add_argument
+    add(
+        f"--{prefix}preset",
+        dest="preset",
+        choices=get_args(Preset),
+        help="how long to fit (default: balanced)",
+    )
+    add(
+        f"--{prefix}time-budget",
+        dest="time_budget_s",
+        metavar="S",
+        type=duration,
+        help="stop the fit after this time (90s, 5m)",
+    )
+    add(
+        f"--{prefix}target-error",
+        dest="target_error",
+        metavar="E",
+        type=float,
+        help="stop the fit when the estimated relMSE is this small",
+    )
+    add(
+        f"--{prefix}device",
+        dest="device",
+        choices=get_args(get_type_hints(FitSettings)["device"]),
+        help="where to fit (default: auto)",
+    )
+
+
+def fit_settings(options: argparse.Namespace, names: Sequence[str]) -> FitSettings:
+    """Return the settings with those of the named options that were given."""
+    given = {name: getattr(options, name) for name in names}
+    return FitSettings(**{name: value for name, value in given.items() if value is not None})
+
+
+def denoise_with_progress(buffers: RenderBuffers, settings: FitSettings) -> FitResult:
+    """Mend the buffers, denoise them and show progress on stderr."""
+    from tungsten_dip.fit import denoise  # imports torch
+
+    mended, lines = sanitize(buffers, settings.threads)
+    for line in lines:
+        log.warning(line)
+    with progress_on_stderr("denoising") as progress:
+        return denoise(mended, settings, progress)
+
+
+def write_report(
+    path: Path, title: str, buffers: RenderBuffers, result: FitResult, tonemap: str, remarks: Sequence[str]
+) -> None:
+    """Write the HTML page whole or not at all."""
+    page = report_page(title, buffers, result, tonemap, remarks)
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")

@@ -1,0 +1,119 @@
+"""Which files a scene asks for, named and placed as Tungsten does, and writing them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tungsten_dip.buffers import PLANES, Buffer, FloatImage, RenderBuffers, check_writable, write_image
+from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
+from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.scene.types import OutputBuffer, Scene
+
+
+@dataclass(frozen=True)
+class SceneOutputs:
+    """Absolute paths of what one scene writes.
+
+    ``ldr`` (PNG) and ``hdr`` are the picture itself, None where it is not asked for; ``buffers`` are the
+    scene's ``output_buffers``, their file names made absolute.
+    """
+
+    ldr: Path | None
+    hdr: Path | None
+    buffers: tuple[OutputBuffer, ...] = ()
+
+    def beside(self, suffix: str) -> Path:
+        """Return the path of a file beside the picture: its name without extension, then ``suffix``."""
+        picture = self.ldr or self.hdr or Path.cwd() / "TungstenRender"
+        return picture.with_name(picture.stem + suffix)
+
+    def with_both_pictures(self) -> SceneOutputs:
+        """Return the outputs with the picture written both displayed and as radiance."""
+        return replace(self, ldr=self.ldr or self.beside(".png"), hdr=self.hdr or self.beside(".exr"))
+
+    def check(self) -> None:
+        """Raise InputError if one of the files cannot be written."""
+        for path in filter(None, [self.ldr, *(_path(buffer.ldr_output_file) for buffer in self.buffers)]):
+            check_writable(path, (".png",))
+        for path in filter(None, [self.hdr, *(_path(buffer.hdr_output_file) for buffer in self.buffers)]):
+            check_writable(path, RADIANCE_SUFFIXES)
+
+
+def scene_outputs(
+    scene: Scene, input_directory: Path, output_directory: Path | None, ldr: Path | None, hdr: Path | None
+) -> SceneOutputs:
+    """Decide where a scene's files go; the last three arguments are the command line's, None if not given.
+
+    The scene's names are relative to its ``output_directory``, that to ``input_directory``. The command
+    line's names are relative to its output directory, or else to the working directory.
+    """
+    renderer = scene.renderer
+    folder = output_directory or input_directory / renderer.output_directory
+    own_folder = output_directory or Path.cwd()
+
+    def placed(own: Path | None, name: str) -> Path | None:
+        path = own_folder / own if own else folder / name if name else None
+        return path if path is None or renderer.overwrite_output_files else _unused(path)
+
+    buffers = tuple(
+        replace(
+            buffer,
+            ldr_output_file=str(folder / buffer.ldr_output_file) if buffer.ldr_output_file else "",
+            hdr_output_file=str(folder / buffer.hdr_output_file) if buffer.hdr_output_file else "",
+        )
+        for buffer in renderer.output_buffers
+    )
+    return SceneOutputs(
+        ldr=placed(ldr, renderer.output_file), hdr=placed(hdr, renderer.hdr_output_file), buffers=buffers
+    )
+
+
+def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) -> None:
+    """Write the picture and the buffers that the scene asks for."""
+    if outputs.hdr is not None:
+        write_image(outputs.hdr, buffers.color.mean)
+    if outputs.ldr is not None:
+        write_image(outputs.ldr, display_from_radiance(buffers.color.mean, tonemap))
+    for request in outputs.buffers:
+        buffer: Buffer | None = getattr(buffers, request.type)
+        if buffer is None:
+            continue
+        for plane, array in _requested(buffer, request):
+            for name in filter(None, (request.hdr_output_file, request.ldr_output_file)):
+                path = Path(name)
+                is_ldr = name == request.ldr_output_file
+                image = _displayed_buffer(array, request.type, plane) if is_ldr else array
+                write_image(path.with_name(path.stem + PLANES[plane] + path.suffix), image)
+
+
+def _requested(buffer: Buffer, request: OutputBuffer) -> Iterator[tuple[str, FloatImage]]:
+    for plane, array in buffer.planes():
+        asked = {"mean": True, "variance": request.sample_variance}.get(plane, request.two_buffer_variance)
+        if asked:
+            yield plane, array
+
+
+def _displayed_buffer(array: FloatImage, quantity: str, plane: str) -> FloatImage:
+    """Scale a buffer for the eye as Tungsten's ``OutputBuffer::saveLdr``: normals and depth to [0, 1]."""
+    if plane == "variance" or quantity not in ("normal", "depth"):
+        return array
+    if quantity == "normal":
+        return array * np.float32(0.5) + np.float32(0.5)
+    return array / np.float32(array.max(initial=0) or 1)
+
+
+def _path(name: str) -> Path | None:
+    return Path(name) if name else None
+
+
+def _unused(path: Path) -> Path:
+    """Return the path, or the first of ``name001``, ``name002``, ... that does not exist."""
+    candidate, index = path, 0
+    while candidate.exists():
+        index += 1
+        candidate = path.with_name(f"{path.stem}{index:03d}{path.suffix}")
+    return candidate

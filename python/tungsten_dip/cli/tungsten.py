@@ -1,0 +1,253 @@
+"""The command ``tungsten``: the stock command's options, a host to render with, and ``--dip-denoise``."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import tungsten_dip
+from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
+from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, remarks_from_log, run
+from tungsten_dip.cli.denoising import (
+    FIT_OPTIONS,
+    add_fit_options,
+    denoise_with_progress,
+    fit_settings,
+    write_report,
+)
+from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.hosts import tungsten as tungsten_host
+from tungsten_dip.progress import Progress
+from tungsten_dip.report.preview import side_by_side
+from tungsten_dip.scene.effects import decision_of
+from tungsten_dip.scene.parse import load_scene
+from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.scene.types import Scene
+
+log = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status: 0 only if every output asked for was written."""
+    return run("tungsten", lambda: _run(arguments))
+
+
+def denoise_outputs(
+    buffers: RenderBuffers,
+    outputs: SceneOutputs,
+    tonemap: str,
+    settings: FitSettings,
+    report: Path | None = None,
+    remarks: Sequence[str] = (),
+) -> None:
+    """Denoise a render and write the result beside its own files.
+
+    Writes ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked for,
+    the report. ``remarks`` are lines on the render for the report.
+    """
+    result = denoise_with_progress(buffers, settings)
+    exr, png, pair = _denoised_paths(outputs)
+    noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))
+    write_denoised(exr, result, buffers)
+    write_image(png, denoised)
+    write_image(pair, side_by_side(noisy, denoised))
+    if report is not None:
+        write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
+
+
+def _run(arguments: Sequence[str] | None) -> None:
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    parser, options = _parser(), _parser().parse_args(arguments)
+    if not options.scenes:
+        parser.print_help()
+        return
+    if not options.dip_denoise:
+        for name in (*FIT_OPTIONS, "report"):
+            if getattr(options, name) is not None:
+                raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
+    for name in ("output_file", "hdr_output_file", "report"):
+        path, count = getattr(options, name), len(options.scenes)
+        if path is not None and count > 1:
+            raise InputError(f"{path}: one file for {count} scenes; render them one at a time")
+
+    host = options.host
+    if host == "auto":
+        host = "tungsten" if tungsten_host.available() else "mitsuba"
+    log.info("rendering with %s", host.capitalize())
+    if host == "mitsuba":
+        _check_for_mitsuba(options)
+    elif not options.dip_denoise:
+        tungsten_host.run_native(_stock_arguments(arguments))
+    elif not tungsten_host.in_process():
+        tungsten_host.run_native(arguments)
+
+    settings = fit_settings(options, FIT_OPTIONS)
+    failed = 0
+    for path in options.scenes:
+        try:
+            _render_scene(path, host, options, settings)
+        except InputError as error:
+            if len(options.scenes) == 1:
+                raise
+            failed += 1
+            log.error("%s", error)
+    if failed:
+        raise InputError(f"{failed} of {len(options.scenes)} scenes failed, see above")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="tungsten", description="Render scenes in Tungsten's format, and denoise them.")
+    add = parser.add_argument
+    add(
+        "-v",
+        "--version",
+        action="version",
+        version=f"tungsten, version {tungsten_dip.__version__} (tungsten-dip)",
+    )
+    add("scenes", metavar="scene", type=Path, nargs="*", help="scene files (JSON)")
+    add("-t", "--threads", metavar="N", type=int, help="number of threads (default: one per core)")
+    add("-r", "--restart", action="store_true", help="ignore saved render checkpoints and start from 0 spp")
+    add(
+        "-c",
+        "--checkpoint",
+        metavar="S",
+        type=minutes,
+        help="render time before a checkpoint is saved; 0: none",
+    )
+    add(
+        "-i",
+        "--input-directory",
+        metavar="DIR",
+        type=Path,
+        help="where the scenes' files are (default: beside them)",
+    )
+    add(
+        "-d",
+        "--output-directory",
+        metavar="DIR",
+        type=Path,
+        help="where output goes, made if it does not exist",
+    )
+    add("--spp", metavar="N", type=int, help="samples per pixel in place of the scene's")
+    add(
+        "--timeout",
+        metavar="S",
+        type=minutes,
+        help="maximum render time (minutes, or 90s, 1.5h); 0: unlimited",
+    )
+    add("-s", "--seed", metavar="N", type=int, help="random seed")
+    add("-o", "--output-file", metavar="FILE", type=Path, help="PNG in place of the scene's output_file")
+    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR or PFM in place of hdr_output_file")
+    add("--host", choices=("auto", "tungsten", "mitsuba"), default="auto",
+        help="who renders (default: Tungsten where it was built in, else Mitsuba)")  # fmt: skip
+    dip = parser.add_argument_group("denoising")
+    dip.add_argument("--dip-denoise", action="store_true", help="denoise the picture with a deep image prior")
+    add_fit_options(dip, prefix="dip-")
+    dip.add_argument(
+        "--dip-report",
+        dest="report",
+        metavar="R.html",
+        type=Path,
+        help="write a page with pictures and error",
+    )
+    return parser
+
+
+def _check_for_mitsuba(options: argparse.Namespace) -> None:
+    """Refuse what only Tungsten can do. A restart is what Mitsuba does anyway."""
+    for flag, value in (("--checkpoint", options.checkpoint), ("--timeout", options.timeout)):
+        if value:
+            raise InputError(f"{flag}: the host Mitsuba cannot; leave it out, or use --host tungsten")
+
+
+def _stock_arguments(arguments: Sequence[str]) -> list[str]:
+    """Return the command line without ``--host``, which the stock command does not know."""
+    stock, rest = [], iter(arguments)
+    for argument in rest:
+        if argument == "--host":
+            next(rest)
+        elif not argument.startswith("--host="):
+            stock.append(argument)
+    return stock
+
+
+def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: FitSettings) -> None:
+    """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files."""
+    scene = load_scene(path, options.input_directory)
+    if options.output_directory is not None:
+        options.output_directory.mkdir(parents=True, exist_ok=True)
+    outputs = scene_outputs(
+        scene,
+        options.input_directory or path.parent,
+        options.output_directory,
+        options.output_file,
+        options.hdr_output_file,
+    )
+    left = outputs = outputs.with_both_pictures() if options.dip_denoise else outputs
+    outputs.check()
+    if options.dip_denoise:
+        for derived in _denoised_paths(outputs):
+            check_writable(derived, (derived.suffix,))
+    if options.report is not None:
+        check_writable(options.report, (".html",))
+
+    with remarks_from_log() as remarks:
+        with progress_on_stderr(f"rendering {path.name}") as progress:
+            if host == "tungsten":
+                rendered = tungsten_host.drive(path, _driver_options(options), progress=progress)
+                buffers = rendered.buffers
+                left = SceneOutputs(
+                    ldr=None if rendered.output_file else outputs.ldr,
+                    hdr=None if rendered.hdr_output_file else outputs.hdr,
+                )
+            else:
+                buffers = _render_with_mitsuba(scene, options, progress)
+        write_render(buffers, left, scene.camera.tonemap)
+        for written in filter(None, (outputs.ldr, outputs.hdr)):
+            log.info("wrote %s", written)
+        if options.dip_denoise:
+            denoise_outputs(buffers, outputs, scene.camera.tonemap, settings, options.report, remarks)
+
+
+def _driver_options(options: argparse.Namespace) -> tungsten_host.DriverOptions:
+    return tungsten_host.DriverOptions(
+        threads=options.threads,
+        spp=options.spp,
+        seed=options.seed,
+        restart=options.restart,
+        checkpoint_interval_s=options.checkpoint,
+        timeout_s=options.timeout,
+        input_directory=options.input_directory,
+        output_directory=options.output_directory,
+        output_file=options.output_file,
+        hdr_output_file=options.hdr_output_file,
+    )
+
+
+def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Progress) -> RenderBuffers:
+    from tungsten_dip.hosts.mitsuba import render  # imports Mitsuba
+
+    if scene.renderer.enable_resume_render or scene.renderer.checkpoint_interval != "0":
+        log.warning("%s: the host Mitsuba saves no checkpoints and starts from 0 spp", scene.path)
+    wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}
+    if options.dip_denoise:
+        wanted |= set(decision_of(scene).buffers)
+    return render(
+        scene,
+        spp=options.spp or scene.renderer.spp,
+        seed=options.seed or 0,
+        threads=options.threads,
+        progress=progress,
+        quantities=[name for name in CHANNELS if name in wanted],
+    )
+
+
+def _denoised_paths(outputs: SceneOutputs) -> tuple[Path, Path, Path]:
+    names = ("_denoised.exr", "_denoised.png", "_side_by_side.png")
+    exr, png, pair = (outputs.beside(name) for name in names)
+    return exr, png, pair

@@ -1,0 +1,196 @@
+"""The command ``tungsten-dip``: denoise saved buffers, look into scenes and files, compare images."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+
+import tungsten_dip
+from tungsten_dip.buffers import (
+    RenderBuffers,
+    check_writable,
+    read_buffers,
+    read_image,
+    write_denoised,
+    write_image,
+)
+from tungsten_dip.cli.console import Parser, json_on_stdout, remarks_from_log, run
+from tungsten_dip.cli.denoising import (
+    FIT_OPTIONS,
+    add_fit_options,
+    denoise_with_progress,
+    fit_settings,
+    write_report,
+)
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings, Inputs
+
+INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
+
+NETWORK_OPTIONS = ("network", "inputs", "scheme", "channels")
+"""What only the preset ``paper`` leaves to choose."""
+
+TONEMAP = "gamma"
+"""How saved buffers are displayed: Tungsten's default."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status: 0 only if every output asked for was written."""
+    return run("tungsten-dip", lambda: _run(arguments))
+
+
+def _run(arguments: Sequence[str] | None) -> None:
+    options = _parser().parse_args(arguments)
+    with json_on_stdout(options.json) as emit:
+        facts, text = options.action(options)
+        if options.json:
+            emit(facts)
+        else:
+            print(text)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="tungsten-dip", description="Denoise saved buffers, inspect scenes, compare images.")
+    parser.add_argument("--version", action="version", version=f"tungsten-dip {tungsten_dip.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+
+    denoise = commands.add_parser("denoise", help="denoise saved buffers")
+    denoise.set_defaults(action=_denoise)
+    add = denoise.add_argument
+    add("input", metavar="INPUT", type=Path, help=INPUT_HELP)
+    add(
+        "-o",
+        "--output",
+        metavar="OUT.exr",
+        type=Path,
+        required=True,
+        help="where to write the denoised image",
+    )
+    add_fit_options(denoise, prefix="")
+    add("--iterations", metavar="N", type=int, help="stop the fit after this many iterations")
+    add("--seed", metavar="N", type=int, help="of the network's first weights and its input (default: 0)")
+    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+    types = get_type_hints(FitSettings)
+    paper = denoise.add_argument_group("the network of the published method, with --preset paper")
+    paper.add_argument("--network", choices=get_args(types["network"]), help="(default: skip)")
+    paper.add_argument("--inputs", choices=get_args(Inputs), help="(default: all+random)")
+    paper.add_argument("--scheme", choices=get_args(types["scheme"]), help="(default: iic)")
+    paper.add_argument("--channels", metavar="8,16,...", type=_counts, help="(default: 8,16,32,64,128)")
+    files = denoise.add_argument_group("files")
+    files.add_argument("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[],
+                       help="take this layer for color, albedo, normal, depth, colorA, ...")  # fmt: skip
+    files.add_argument("--half", action="store_true", help="write 16-bit floats")
+    files.add_argument(
+        "--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel"
+    )
+    files.add_argument("--report", metavar="R.html", type=Path, help="write a page with pictures and error")
+
+    inspect = commands.add_parser("inspect", help="show what a scene calls for, or what a file holds")
+    inspect.set_defaults(action=_inspect)
+    inspect.add_argument("input", metavar="SCENE|INPUT", type=Path, help=f"a scene, or {INPUT_HELP}")
+
+    compare = commands.add_parser("compare", help="measure an image against its reference")
+    compare.set_defaults(action=_compare)
+    compare.add_argument("image", metavar="IMAGE", type=Path)
+    compare.add_argument("reference", metavar="REFERENCE", type=Path)
+
+    for command in (denoise, inspect, compare):
+        command.add_argument(
+            "--json", action="store_true", help="print one JSON object on stdout, nothing else"
+        )
+    return parser
+
+
+def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    fixed = [name for name in NETWORK_OPTIONS if getattr(options, name) is not None]
+    if fixed and options.preset != "paper":
+        raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
+    names = (*FIT_OPTIONS, "iterations", "seed", "threads", *NETWORK_OPTIONS)
+    settings = fit_settings(options, names)
+    for path, suffix in ((options.output, ".exr"), (options.error_map, ".exr"), (options.report, ".html")):
+        if path is not None:
+            check_writable(path, (suffix,))
+
+    with remarks_from_log() as remarks:
+        buffers = read_buffers(options.input, dict(options.map))
+        result = denoise_with_progress(buffers, settings)
+    write_denoised(options.output, result, buffers, half=options.half)
+    if options.error_map is not None:
+        if result.error is None:
+            raise InputError(
+                f"{options.error_map}: not written: the error is not known without halves A and B of the "
+                "colour; render with two_buffer_variance"
+            )
+        write_image(options.error_map, result.error)
+    if options.report is not None:
+        write_report(options.report, options.input.name, buffers, result, TONEMAP, remarks)
+
+    facts = {
+        "output": str(options.output),
+        "width": buffers.width,
+        "height": buffers.height,
+        "seconds": result.seconds,
+        "iterations": result.iterations,
+        "estimated_relmse": result.estimated_relmse,
+        "settings": asdict(result.settings),
+        "history": [asdict(point) for point in result.history],
+        "notes": list(result.notes),
+    }
+    known = result.estimated_relmse is not None
+    error = f", estimated relMSE {result.estimated_relmse:.3g}" if known else ""
+    return facts, f"{options.output}: {result.iterations} iterations in {result.seconds:.1f} s{error}"
+
+
+def _inspect(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    if options.input.suffix.lower() == ".json":
+        from tungsten_dip.scene.effects import inspect_facts, inspect_text
+        from tungsten_dip.scene.parse import load_scene
+
+        scene = load_scene(options.input)
+        return inspect_facts(scene), inspect_text(scene)
+    return _facts_of_buffers(read_buffers(options.input))
+
+
+def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
+    spp = None if buffers.spp is None else float(np.mean(buffers.spp))
+    quantities = {}
+    lines = [
+        f"{buffers.width} x {buffers.height} pixels" + ("" if spp is None else f", {spp:g} samples per pixel")
+    ]
+    for name, buffer in buffers.quantities():
+        planes = dict(buffer.planes())
+        nonfinite = sum(int(np.count_nonzero(~np.isfinite(array))) for array in planes.values())
+        quantities[name] = {"planes": list(planes), "nonfinite": nonfinite}
+        bad = f", {nonfinite} values not finite" if nonfinite else ""
+        lines.append(f"{name:<11}{', '.join(planes)}{bad}")
+    return {
+        "width": buffers.width,
+        "height": buffers.height,
+        "spp": spp,
+        "quantities": quantities,
+    }, "\n".join(lines)
+
+
+def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    facts = asdict(tungsten_dip.compare(read_image(options.image), read_image(options.reference)))
+    lines = (f"{name:<11}{'-' if value is None else f'{value:.5g}'}" for name, value in facts.items())
+    return facts, "\n".join(lines)
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected counts such as 8,16,32,64,128, got '{text}'") from None
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, separator, channel = text.partition("=")
+    if not (name and separator and channel):
+        raise argparse.ArgumentTypeError(f"expected NAME=CHANNEL such as color=beauty, got '{text}'")
+    return name, channel

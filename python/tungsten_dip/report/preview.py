@@ -1,0 +1,32 @@
+"""Pictures for the eye, as display-referred values in [0, 1]: side by side, and errors in false colour."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tungsten_dip.buffers.model import FloatImage
+
+GAP_PX = 4
+"""Width of the bar between two pictures side by side."""
+
+FALSE_COLORS = ((0, 0, 4), (66, 15, 117), (147, 38, 103), (221, 81, 58), (252, 165, 10), (252, 255, 164))
+"""8-bit colours from no error to the most: dark to light, so that they read in grey too."""
+
+
+def side_by_side(left: FloatImage, right: FloatImage) -> FloatImage:
+    """Return two pictures of one size beside each other, a white bar between them."""
+    bar = np.ones((left.shape[0], GAP_PX, 3), dtype=np.float32)
+    return np.concatenate([left, bar, right], axis=1)
+
+
+def error_in_false_color(error: FloatImage) -> tuple[FloatImage, float]:
+    """Return a picture of an error map, and the relative error that its brightest colour means.
+
+    The map holds squared relative errors, shape (height, width, 1); the picture, shape (height, width, 3),
+    shows their roots from 0 to the 99th percentile.
+    """
+    relative = np.sqrt(np.maximum(np.nan_to_num(error[..., 0]), 0))
+    most = float(np.percentile(relative, 99)) or 1.0
+    stops = np.linspace(0, most, len(FALSE_COLORS))
+    channels = [np.interp(relative, stops, levels) for levels in np.array(FALSE_COLORS).T / 255]
+    return np.stack(channels, axis=-1).astype(np.float32), most
