@@ -1,0 +1,29 @@
+"""Where torch computes: the device of a fit and its threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings
+
+
+@contextmanager
+def compute_device(settings: FitSettings) -> Iterator[torch.device]:
+    """Yield the device that the settings ask for, with their number of threads set meanwhile.
+
+    Raises InputError if the device is not there.
+    """
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        raise InputError("device cuda: expected one that torch can use, found none; use cpu or auto")
+    use_cuda = settings.device != "cpu" and torch.cuda.is_available()
+    threads_before = torch.get_num_threads()
+    torch.set_num_threads(settings.threads or os.cpu_count() or 1)
+    try:
+        yield torch.device("cuda" if use_cuda else "cpu")
+    finally:
+        torch.set_num_threads(threads_before)

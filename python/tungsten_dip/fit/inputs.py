@@ -1,0 +1,109 @@
+"""What the published method shows its network and asks of it: images in [0, 1], as Tungsten's PNGs hold them.
+
+Tungsten writes (`OutputBuffer::saveLdr`) normals as (n + 1) / 2, depth divided by its largest value, albedo
+and every variance as they are, all clipped to [0, 1]. Grey images are read as three equal channels. Here
+nothing is rounded to 8 bits, and colour is tone-mapped with gamma 2.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings
+
+RANDOM_CHANNELS = 3
+"""Channels of fixed random input, where there are any."""
+
+_QUANTITY_FROM_INPUTS = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
+_QUANTITIES = ("normal", "albedo", "depth")
+_PLANES = ("mean", "half_a", "half_b", "variance")
+_GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class PaperImages:
+    """``given`` is shown to the network beside ``random_channels``; its output is compared with ``wanted``.
+
+    Both are float32 in [0, 1], shape (height, width, channels). The first three channels of ``wanted`` are
+    the colour. ``notes`` says in one line each what was missing or left out.
+    """
+
+    given: FloatImage
+    random_channels: int
+    wanted: FloatImage
+    notes: tuple[str, ...]
+
+
+def ldr_from_radiance(radiance: FloatImage) -> FloatImage:
+    """Clip linear radiance to [0, 1] and apply gamma 2.2."""
+    return np.clip(radiance, 0, 1) ** np.float32(1 / _GAMMA)
+
+
+def radiance_from_ldr(ldr: FloatImage) -> FloatImage:
+    """Undo `ldr_from_radiance`, but for what it clipped."""
+    return ldr ** np.float32(_GAMMA)
+
+
+def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
+    """Gather the images for ``settings.scheme`` and ``settings.inputs``.
+
+    Increased input channels (``iic``): the features go in, the colour comes out. Increased output channels
+    (``ioc``): only random channels go in, colour and all features come out. ``all`` holds the noisy colour
+    too. Channels of one value carry nothing and are left out.
+
+    Raises InputError if a feature that was asked for by name is missing, or nothing at all would go in.
+    """
+    color = ldr_from_radiance(buffers.color.mean)
+    features = [color] if settings.scheme == "iic" and settings.inputs.startswith("all") else []
+    random_channels = RANDOM_CHANNELS if settings.scheme == "ioc" or "random" in settings.inputs else 0
+    notes = []
+
+    quantities: tuple[str, ...] = ()
+    if settings.scheme == "ioc" or settings.inputs.startswith("all"):
+        quantities = _QUANTITIES
+    elif settings.inputs in _QUANTITY_FROM_INPUTS:
+        quantities = (_QUANTITY_FROM_INPUTS[settings.inputs],)
+        if getattr(buffers, quantities[0]) is None:
+            raise InputError(
+                f"inputs {settings.inputs}: expected a {quantities[0]} buffer, found none; "
+                f"render it, or use inputs all (what is there) or random"
+            )
+    for quantity in quantities:
+        buffer = getattr(buffers, quantity)
+        missing = _PLANES if buffer is None else [p for p in _PLANES if getattr(buffer, p) is None]
+        if missing:
+            notes.append(f"{quantity}: no {', '.join(missing)}, used without")
+        if buffer is not None:
+            features += _ldr_from_feature(quantity, buffer)
+
+    stack = np.concatenate([color[:, :, :0], *features], axis=2)
+    varies = stack.min(axis=(0, 1)) < stack.max(axis=(0, 1))
+    if not varies.all():
+        notes.append(f"{np.count_nonzero(~varies)} of {varies.size} feature channels are constant: left out")
+    stack = np.ascontiguousarray(stack[:, :, varies])
+
+    if settings.scheme == "ioc":
+        wanted = np.concatenate([color, stack], axis=2)
+        return PaperImages(stack[:, :, :0], random_channels, wanted, tuple(notes))
+    if stack.shape[2] + random_channels == 0:
+        raise InputError(
+            f"inputs {settings.inputs}: expected a channel that varies over the image, all are constant; "
+            f"use inputs random"
+        )
+    return PaperImages(stack, random_channels, color, tuple(notes))
+
+
+def _ldr_from_feature(quantity: str, buffer: Buffer) -> list[FloatImage]:
+    """Every known plane of a feature as three channels in [0, 1]."""
+    images = []
+    for plane, values in buffer.planes():
+        if plane != "variance" and quantity == "normal":
+            values = (values + 1) / 2
+        elif plane != "variance" and quantity == "depth":
+            values = values / max(values.max(initial=0, where=np.isfinite(values)), np.finfo(np.float32).tiny)
+        images.append(np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3)))
+    return images

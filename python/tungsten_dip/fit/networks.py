@@ -1,0 +1,228 @@
+"""The two networks of the published method: Skip (Ulyanov et al., "Deep Image Prior", CVPR 2018) and ResNet.
+
+Both take (batch, channels, height, width) of any size from 1x1 and return the same size. A batch norm always
+uses the statistics of the batch in hand, in ``eval()`` too: on one image it is an instance norm.
+
+On a CPU both are fastest with channels last in memory (``network.to(memory_format=torch.channels_last)``, and
+the input alike).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+LEAKY_SLOPE = 0.2
+"""Slope of the leaky ReLU below zero (published code)."""
+
+Pointwise = Callable[[Tensor], Tensor]
+"""A function that treats every pixel alike and by itself."""
+
+
+class Skip(nn.Module):
+    """Encoder and decoder with connections across at the coarse scales.
+
+    ``channels`` are the counts from the finest scale to the coarsest, down and up alike; ``skip_channels``
+    those of the connections across (0: none), by default 4 at the two coarsest scales. ``final`` maps what
+    the last convolution gives to output values. The input is mirrored up to a multiple of 2**scales and the
+    output cropped back.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int = 3,
+        channels: tuple[int, ...] = (8, 16, 32, 64, 128),
+        skip_channels: tuple[int, ...] | None = None,
+        final: Pointwise = torch.sigmoid,
+    ) -> None:
+        super().__init__()
+        scales = len(channels)
+        if skip_channels is None:
+            skip_channels = ((0,) * scales + (4, 4))[-scales:]
+        sources = (in_channels, *channels[:-1])
+        deeper = (*channels[1:], channels[-1])
+        self.down = nn.ModuleList(_Down(i, o) for i, o in zip(sources, channels, strict=True))
+        self.side = nn.ModuleList(
+            _Side(i, s) if s else None for i, s in zip(sources, skip_channels, strict=True)
+        )
+        self.up = nn.ModuleList(
+            _Up(s + d, o) for s, d, o in zip(skip_channels, deeper, channels, strict=True)
+        )
+        self.head = nn.Conv2d(channels[0], out_channels, 1)
+        self.final = final
+        self.multiple = 2**scales
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map (batch, in_channels, height, width) to (batch, out_channels, height, width)."""
+        height, width = image.shape[2:]
+        # The coarsest scale needs two pixels each way: one pixel can neither be mirrored nor normalised.
+        x = mirror_to_multiple(image, self.multiple, at_least=2 * self.multiple)
+        sides: list[Tensor | None] = []
+        for down, side in zip(self.down, self.side, strict=True):
+            sides.append(None if side is None else side(x))
+            x = down(x)
+        *coarse, finest = reversed(list(zip(self.up, sides, strict=True)))
+        for up, across in coarse:
+            x = up(x, across)
+        up, across = finest
+        return up(x, across, then=lambda y: self.final(self.head(y)))[:, :, :height, :width]
+
+
+class ResNet(nn.Module):
+    """Residual blocks at full resolution: conv, norm, leaky ReLU, conv, norm, plus the identity."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int = 3,
+        blocks: int = 10,
+        width: int = 32,
+        final: Pointwise = torch.sigmoid,
+    ) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(in_channels, width, 3, padding=1, padding_mode="reflect")
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(width, width, 3, padding=1, bias=False),
+                _NormAct(width),
+                nn.Conv2d(width, width, 3, padding=1, bias=False),
+                _Norm(width),
+            )
+            for _ in range(blocks)
+        )
+        self.gather = nn.Sequential(nn.Conv2d(width, width, 3, padding=1), _Norm(width))
+        self.last = nn.Conv2d(width, out_channels, 3, padding=1, padding_mode="reflect")
+        self.final = final
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map (batch, in_channels, height, width) to (batch, out_channels, height, width)."""
+        height, width = image.shape[2:]
+        x = F.leaky_relu_(self.first(mirror_to_multiple(image, 1, at_least=2)), LEAKY_SLOPE)
+        for block in self.blocks:
+            x = x + block(x)
+        return self.final(self.last(self.gather(x)))[:, :, :height, :width]
+
+
+def mirror_to_multiple(image: Tensor, multiple: int, at_least: int) -> Tensor:
+    """Continue (..., height, width) below and to the right by mirroring, as often as it takes."""
+    for axis in (-2, -1):
+        size = image.shape[axis]
+        padded = max(-(-size // multiple) * multiple, at_least)
+        if padded != size:
+            period = max(2 * size - 2, 1)
+            step = torch.arange(padded, device=image.device) % period
+            image = image.index_select(axis, torch.minimum(step, period - step))
+    return image
+
+
+class _Norm(nn.BatchNorm2d):
+    """Batch norm that keeps no running statistics."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels, track_running_stats=False)
+
+
+class _NormAct(_Norm):
+    """Batch norm, then leaky ReLU in place."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
+
+
+class _Down(nn.Sequential):
+    """Halve the resolution."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__(
+            nn.Conv2d(in_channels, out_channels, 3, stride=2, padding=1, padding_mode="reflect"),
+            _NormAct(out_channels),
+            nn.Conv2d(out_channels, out_channels, 3, padding=1, padding_mode="reflect"),
+            _NormAct(out_channels),
+        )
+
+
+class _Side(nn.Sequential):
+    """The connection across at one scale."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__(nn.Conv2d(in_channels, out_channels, 1), _NormAct(out_channels))
+
+
+class _Up(nn.Module):
+    """Double the resolution: upsample bilinearly, join what comes in, norm, 3x3, norm, act, 1x1, norm, act.
+
+    The 3x3 convolution sees the edge repeated, where the published code mirrors it. Upsampling and
+    convolution are then together one convolution of the coarse image, with one kernel for each of the four
+    pixels that a coarse pixel becomes: the same values, without the large image in between.
+    """
+
+    phase_kernels: Tensor
+    blur: Tensor
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.norm = _Norm(in_channels)
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, padding_mode="replicate")
+        self.blend = nn.Sequential(
+            _NormAct(out_channels), nn.Conv2d(out_channels, out_channels, 1), _NormAct(out_channels)
+        )
+        self.register_buffer("phase_kernels", _phase_kernels(), persistent=False)
+        self.register_buffer("blur", _upsampling_blur(), persistent=False)
+
+    def forward(self, coarse: Tensor, across: Tensor | None, then: Pointwise | None = None) -> Tensor:
+        """Return the finer image, with ``then`` applied to it."""
+        if across is None:
+            y = self.blend(self._phases(coarse))
+            return _image_from_phases(then(y) if then else y, coarse.shape[2], coarse.shape[3])
+        fine = F.interpolate(coarse, scale_factor=2, mode="bilinear")
+        y = self.blend(self.conv(self.norm(torch.cat((across, fine), 1))))
+        return then(y) if then else y
+
+    def _phases(self, coarse: Tensor) -> Tensor:
+        """Equal ``conv(norm(upsample(coarse)))``, in the order of pixels that `_image_from_phases` undoes."""
+        batch, channels, height, width = coarse.shape
+        edged = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
+
+        # Upsampling U keeps the mean; the mean square of Ux is that of x with x blurred by U'U.
+        mean = _pixel_mean(coarse)
+        offset = coarse - mean[:, None, None]
+        blurred = F.conv2d(edged, self.blur.expand(channels, 1, 3, 3), groups=channels) - mean[:, None, None]
+        variance = _pixel_mean(offset * blurred)
+
+        # The norm is affine, so it goes into the weights.
+        scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
+        shift = self.norm.bias - mean * scale
+        bias = self.conv.bias + self.conv.weight.sum((2, 3)) @ shift
+        kernel = (self.conv.weight * scale[:, None, None]).flatten(2) @ self.phase_kernels
+        kernel = kernel.unflatten(2, (4, 3, 3)).permute(2, 0, 1, 3, 4).flatten(0, 1)
+        y = F.conv2d(edged, kernel.contiguous(memory_format=torch.channels_last), bias.repeat(4))
+        return y.permute(0, 2, 3, 1).reshape(batch, height, width * 4, -1).permute(0, 3, 1, 2)
+
+
+def _image_from_phases(y: Tensor, height: int, width: int) -> Tensor:
+    """Bring (batch, channels, height, width * 2 * 2) into the order of an image twice as high and wide."""
+    y = y.permute(0, 2, 3, 1).unflatten(2, (width, 2, 2)).transpose(2, 3)
+    return y.reshape(y.shape[0], 2 * height, 2 * width, -1).permute(0, 3, 1, 2)
+
+
+def _pixel_mean(x: Tensor) -> Tensor:
+    """Mean over all but channels; rows first, for that is what runs fast with channels last."""
+    return x.mean(2).mean((0, 2))
+
+
+def _upsampling_blur() -> Tensor:
+    """The 3x3 kernel of U'U, U being bilinear upsampling by 2, scaled to sum 1."""
+    taps = torch.tensor([3.0, 10.0, 3.0]) / 16
+    return torch.outer(taps, taps)
+
+
+def _phase_kernels() -> Tensor:
+    """Shape (9, 4 * 9): what a tap on the upsampled image is to the taps of each phase on the coarse one."""
+    # Row r: what coarse pixels i-1, i, i+1 give to fine pixel 2i-1+r.
+    fine_from_coarse = torch.tensor([[0.75, 0.25, 0], [0.25, 0.75, 0], [0, 0.75, 0.25], [0, 0.25, 0.75]])
+    phases = torch.stack((fine_from_coarse[:3], fine_from_coarse[1:]))
+    return torch.einsum("ptl,qsm->tspqlm", phases, phases).reshape(9, 36)

@@ -1,0 +1,196 @@
+"""The published method, to the letter where its code fixes it: the preset ``paper``.
+
+Souri & Zakeri, "Deep Learning Based Denoiser for Images Rendered by Monte Carlo Sampling": a network is
+fitted to one noisy LDR image by mean squared error, and the running average of its outputs is the denoised
+image. This differs from the published code where that code
+
+- crops the image to a multiple of 32: here it is padded, and the output cropped back;
+- reads PNGs: here the images are not rounded to 8 bits, and channels of one value are left out;
+- mirrors the edge of every 3x3 convolution: here those after an upsampling repeat it (`networks`);
+- draws the input noise of every iteration anew: here it is a random window of a pool of Gaussian noise;
+- takes one more step, and skips the test at every hundredth iteration, when it backtracks.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.device import compute_device
+from tungsten_dip.fit.inputs import PaperImages, paper_images, radiance_from_ldr
+from tungsten_dip.fit.networks import ResNet, Skip
+from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.progress import Progress, silent
+
+# The numbers of the published notebook.
+ITERATIONS = 3000
+LEARNING_RATE = 1e-3
+LOW_LOSS = 5e-4
+LOW_LOSS_LEARNING_RATE = 1e-4
+RANDOM_INPUT_SCALE = 0.1
+INPUT_NOISE_STD = 1 / 30
+AVERAGE_WEIGHT = 0.99
+BACKTRACK_DB = 5.0
+
+_HISTORY_EVERY = 100
+_NOISE_WINDOWS = 1 << 16
+_NOISE_STRIDE = 16
+
+
+class PaperFit:
+    """One fit in progress: every `step` is one iteration.
+
+    ``loss`` is the mean squared error over all output channels, ``psnr`` that of the colour to the noisy
+    colour in dB, both of the latest iteration's output.
+    """
+
+    def __init__(self, images: PaperImages, settings: FitSettings, device: torch.device) -> None:
+        self.loss = math.inf
+        self.psnr = -math.inf
+        self._last_good_psnr = -math.inf
+        generator = torch.Generator().manual_seed(settings.seed)
+
+        height, width, given_channels = images.given.shape
+        channels = images.random_channels + given_channels
+        random = torch.rand(height, width, images.random_channels, generator=generator) * RANDOM_INPUT_SCALE
+        fixed = torch.cat((random, torch.from_numpy(images.given)), 2)
+        self._input = _nchw(fixed.to(device))
+        self._noisy_input = torch.empty_like(self._input)
+        # Drawing every value anew would cost more than the network's first layer. The noise of an iteration
+        # is a window of this pool at a place drawn anew, so that no pixel sees the same value twice but by
+        # chance.
+        pool_size = fixed.numel() + _NOISE_WINDOWS * _NOISE_STRIDE
+        self._noise_pool = torch.randn(pool_size, generator=generator).to(device)
+        self._generator = generator
+
+        self._wanted = _nchw(torch.from_numpy(images.wanted).to(device))
+        self._average: Tensor | None = None
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(settings.seed)
+            outputs = images.wanted.shape[2]
+            self.network: nn.Module = (
+                Skip(channels, outputs, settings.channels)
+                if settings.network == "skip"
+                else ResNet(channels, outputs)
+            )
+        self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._weights: list[Tensor] = list(self.network.parameters())
+        self._good_weights = [weight.detach().clone() for weight in self._weights]
+        self._optimizer = torch.optim.Adam(self._weights, lr=LEARNING_RATE, fused=True)
+
+    def step(self) -> None:
+        """Do one iteration."""
+        window = _NOISE_STRIDE * int(torch.randint(_NOISE_WINDOWS, (), generator=self._generator))
+        noise = self._noise_pool[window : window + self._input.numel()]
+        noise = noise.view(self._input.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
+        torch.add(self._input, noise, alpha=INPUT_NOISE_STD, out=self._noisy_input)
+
+        output = self.network(self._noisy_input)
+        loss = F.mse_loss(output, self._wanted)
+        seen = output.detach()
+        if self._average is None:
+            self._average = seen.clone()
+        else:
+            self._average.lerp_(seen, 1 - AVERAGE_WEIGHT)
+
+        self.loss = loss.item()
+        color_loss = self.loss if seen.shape[1] == 3 else F.mse_loss(seen[:, :3], self._wanted[:, :3]).item()
+        self.psnr = -10 * math.log10(max(color_loss, 1e-12))
+        if not self.psnr >= self._last_good_psnr - BACKTRACK_DB:
+            with torch.no_grad():
+                torch._foreach_copy_(self._weights, self._good_weights)
+            return
+        with torch.no_grad():
+            torch._foreach_copy_(self._good_weights, self._weights)
+        self._last_good_psnr = self.psnr
+
+        self._optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._optimizer.param_groups[0]["lr"] = learning_rate(self.loss)
+        self._optimizer.step()
+
+    def color(self) -> FloatImage:
+        """Return the average so far as linear radiance, shape (height, width, 3)."""
+        if self._average is None:
+            raise RuntimeError("no iteration has been done yet")
+        ldr = self._average[0, :3].permute(1, 2, 0).cpu().numpy()
+        return np.ascontiguousarray(radiance_from_ldr(ldr))
+
+
+def learning_rate(loss: float) -> float:
+    """Adam's learning rate at this loss."""
+    return LOW_LOSS_LEARNING_RATE if loss <= LOW_LOSS else LEARNING_RATE
+
+
+def fit_paper(buffers: RenderBuffers, settings: FitSettings, progress: Progress = silent) -> FitResult:
+    """Denoise by the published method.
+
+    Ends after ``settings.iterations`` or ``settings.time_budget_s``, whichever comes first, but not before
+    the first iteration. An interrupt (KeyboardInterrupt) after it ends the fit with the average so far. On a
+    CPU, the same seed and number of threads give the same bits.
+
+    Raises InputError if the image is empty, a feature named by the inputs is missing or the device is not
+    there.
+    """
+    start = time.perf_counter()
+    if buffers.color.mean.size == 0:
+        raise InputError(f"expected at least one pixel, got {buffers.width}x{buffers.height}; render more")
+    images = paper_images(buffers, settings)
+    total = settings.iterations or ITERATIONS
+    notes = [*_notes_on_method(buffers, settings), *images.notes]
+    history = []
+    iteration = 0
+    with compute_device(settings) as device:
+        fit = PaperFit(images, settings, device)
+        try:
+            while iteration < total:
+                fit.step()
+                iteration += 1
+                seconds = time.perf_counter() - start
+                spent = seconds / settings.time_budget_s if settings.time_budget_s else 0.0
+                done = iteration == total or spent >= 1
+                if done or iteration % _HISTORY_EVERY == 0:
+                    history.append(HistoryPoint(seconds, iteration, None))
+                progress(
+                    min(max(iteration / total, spent), 1.0),
+                    f"iteration {iteration}, loss {fit.loss:.2e}, PSNR to noisy {fit.psnr:.2f} dB",
+                )
+                if done:
+                    break
+        except KeyboardInterrupt:
+            if iteration == 0:
+                raise
+            notes.append(f"interrupted at iteration {iteration} of {total}")
+        else:
+            if iteration < total:
+                notes.append(f"the time budget ended at iteration {iteration} of {total}")
+        color = fit.color()
+    return FitResult(
+        color, settings, time.perf_counter() - start, iteration, history=tuple(history), notes=tuple(notes)
+    )
+
+
+def _notes_on_method(buffers: RenderBuffers, settings: FitSettings) -> list[str]:
+    notes = [
+        "no error estimate: the published method fits the mean of all samples, no independent half is left"
+    ]
+    clipped = float((buffers.color.mean > 1).any(axis=2).mean())
+    if clipped:
+        notes.append(f"{clipped:.2%} of the pixels exceed 1: the published method clips highlights")
+    if settings.target_error is not None:
+        notes.append("target_error is not used: the published method cannot tell its error")
+    if settings.scheme == "ioc":
+        notes.append("scheme ioc: the input is random, whatever inputs says")
+    return notes
+
+
+def _nchw(image: Tensor) -> Tensor:
+    """(height, width, channels) as a batch of one, channels last in memory."""
+    return image.contiguous().permute(2, 0, 1)[None]
