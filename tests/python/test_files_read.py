@@ -442,6 +442,24 @@ def test_every_truncation_is_refused(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert capfd.readouterr() == ("", ""), "the libraries must not print"
 
 
+def test_damaged_bytes_read_or_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    save(tmp_path / "whole.exr", *"RGB", *rgb("albedo"), owner="somebody")
+    whole = (tmp_path / "whole.exr").read_bytes()
+    rng = np.random.default_rng(0)
+    refusals = 0
+    for _ in range(300):
+        data = bytearray(whole)
+        for at in rng.integers(0, 600, size=rng.integers(1, 4)):
+            data[at] = rng.integers(0, 256)
+        (tmp_path / "damaged.exr").write_bytes(data)
+        try:
+            read_buffers(tmp_path / "damaged.exr")
+        except InputError:
+            refusals += 1
+    assert 0 < refusals
+    assert capfd.readouterr() == ("", ""), "the libraries must not print"
+
+
 def test_a_header_that_claims_too_much_is_refused(tmp_path: Path) -> None:
     save(tmp_path / "a.exr", *"RGB")
     data = bytearray((tmp_path / "a.exr").read_bytes())

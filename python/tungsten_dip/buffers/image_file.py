@@ -44,29 +44,12 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: no such file; check the name")
     if path.suffix.lower() not in RADIANCE_SUFFIXES:
         raise InputError(f"{path}: holds no linear radiance; expected {', '.join(RADIANCE_SUFFIXES)}")
-    config = oiio.ImageSpec()
-    config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
-    image = oiio.ImageInput.open(str(path), config)
-    if image is None:
-        raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
     try:
-        parts: list[Part] = []
-        while image.seek_subimage(len(parts), 0):
-            parts.append(_part(path, image, len(parts)))
-    finally:
-        image.close()
-    if path.suffix.lower() != ".exr":
-        return tuple(parts)
-    try:
-        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"{path}: has a damaged header ({_one_line(str(error))}); render it again"
-        ) from error
-    return tuple(
-        Part(part.channels, {key: value for key, value in header.items() if key not in _ENCODING}, part.name)
-        for part, header in zip(parts, headers, strict=True)
-    )
+        return _decoded(path)
+    except InputError:
+        raise
+    except (MemoryError, RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
+        raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
 
 
 def read_image(path: str | Path) -> FloatImage:
@@ -132,6 +115,27 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         message = output.geterror()
         if not (written and closed) or message:
             raise OSError(_one_line(message))
+
+
+def _decoded(path: Path) -> tuple[Part, ...]:
+    config = oiio.ImageSpec()
+    config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
+    image = oiio.ImageInput.open(str(path), config)
+    if image is None:
+        raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
+    try:
+        parts: list[Part] = []
+        while image.seek_subimage(len(parts), 0):
+            parts.append(_part(path, image, len(parts)))
+    finally:
+        image.close()
+    if path.suffix.lower() != ".exr":
+        return tuple(parts)
+    headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+    return tuple(
+        Part(part.channels, {key: value for key, value in header.items() if key not in _ENCODING}, part.name)
+        for part, header in zip(parts, headers, strict=True)
+    )
 
 
 def _part(path: Path, image: Any, index: int) -> Part:
