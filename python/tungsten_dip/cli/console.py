@@ -55,12 +55,17 @@ def run(command: str, body: Callable[[], None]) -> int:
     debug = bool(os.environ.get(DEBUG_VARIABLE))
     try:
         body()
+        sys.stdout.flush()
     except KeyboardInterrupt:
         return _fail(command, "interrupted", EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of stdout has had enough; Python would complain when it flushes at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return EXIT_INTERNAL
     except (InputError, OSError) as error:
         if debug:
             raise
-        return _fail(command, str(error), EXIT_INPUT)
+        return _fail(command, _message(error), EXIT_INPUT)
     except Exception as error:
         if debug:
             raise
@@ -179,6 +184,12 @@ def _log_to_stderr(command: str) -> None:
     handler = _StderrHandler()
     handler.setFormatter(logging.Formatter(f"{command}: %(message)s"))
     logger.addHandler(handler)
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}; check the path and its permissions"
+    return str(error)
 
 
 def _fail(command: str, message: str, status: int) -> int:

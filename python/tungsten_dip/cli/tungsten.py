@@ -79,11 +79,11 @@ def _run(arguments: Sequence[str] | None) -> None:
     if host == "auto":
         host = "tungsten" if tungsten_host.available() else "mitsuba"
     log.info("rendering with %s", host.capitalize())
-    if host == "mitsuba":
-        _check_for_mitsuba(options)
-    elif not options.dip_denoise:
+    if host == "mitsuba" and options.checkpoint:
+        raise InputError("--checkpoint: Mitsuba saves none; leave it out, or use --host tungsten")
+    if host == "tungsten" and not options.dip_denoise:
         tungsten_host.run_native(_stock_arguments(arguments))
-    elif not tungsten_host.in_process():
+    if host == "tungsten" and not tungsten_host.in_process():
         tungsten_host.run_native(arguments)
 
     settings = fit_settings(options, FIT_OPTIONS)
@@ -158,13 +158,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check_for_mitsuba(options: argparse.Namespace) -> None:
-    """Refuse what only Tungsten can do. A restart is what Mitsuba does anyway."""
-    for flag, value in (("--checkpoint", options.checkpoint), ("--timeout", options.timeout)):
-        if value:
-            raise InputError(f"{flag}: the host Mitsuba cannot; leave it out, or use --host tungsten")
-
-
 def _stock_arguments(arguments: Sequence[str]) -> list[str]:
     """Return the command line without ``--host``, which the stock command does not know."""
     stock, rest = [], iter(arguments)
@@ -230,18 +223,19 @@ def _driver_options(options: argparse.Namespace) -> tungsten_host.DriverOptions:
 
 
 def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Progress) -> RenderBuffers:
-    from tungsten_dip.hosts.mitsuba import render  # imports Mitsuba
+    from tungsten_dip.hosts.mitsuba.render import render  # imports Mitsuba
 
-    if scene.renderer.enable_resume_render or scene.renderer.checkpoint_interval != "0":
-        log.warning("%s: the host Mitsuba saves no checkpoints and starts from 0 spp", scene.path)
+    if scene.renderer.enable_resume_render:
+        log.warning("%s: asks to resume; Mitsuba saves no state and starts from 0 spp", scene.path)
     wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}
     if options.dip_denoise:
         wanted |= set(decision_of(scene).buffers)
     return render(
         scene,
-        spp=options.spp or scene.renderer.spp,
+        spp=options.spp,
         seed=options.seed or 0,
         threads=options.threads,
+        timeout_s=(minutes(scene.renderer.timeout) if options.timeout is None else options.timeout) or None,
         progress=progress,
         quantities=[name for name in CHANNELS if name in wanted],
     )

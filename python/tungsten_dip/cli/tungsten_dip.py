@@ -28,12 +28,9 @@ from tungsten_dip.cli.denoising import (
     write_report,
 )
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitSettings, Inputs
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
-
-NETWORK_OPTIONS = ("network", "inputs", "scheme", "channels")
-"""What only the preset ``paper`` leaves to choose."""
 
 TONEMAP = "gamma"
 """How saved buffers are displayed: Tungsten's default."""
@@ -107,10 +104,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    fixed = [name for name in NETWORK_OPTIONS if getattr(options, name) is not None]
+    fixed = [name for name in PAPER_SETTINGS if getattr(options, name) is not None]
     if fixed and options.preset != "paper":
         raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
-    names = (*FIT_OPTIONS, "iterations", "seed", "threads", *NETWORK_OPTIONS)
+    names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
     settings = fit_settings(options, names)
     for path, suffix in ((options.output, ".exr"), (options.error_map, ".exr"), (options.report, ".html")):
         if path is not None:

@@ -11,6 +11,9 @@ from tungsten_dip.errors import InputError
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
 
+PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
+"""What the preset ``paper`` alone leaves open."""
+
 
 @dataclass(frozen=True)
 class FitSettings:

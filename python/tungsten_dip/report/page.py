@@ -6,23 +6,22 @@ import base64
 import math
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import asdict
 from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
-from tungsten_dip.fit.settings import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
 from tungsten_dip.report.preview import FALSE_COLORS, error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
 
 CURVE_WIDTH, CURVE_HEIGHT = 720, 260
-CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 70, 16, 12, 44
+CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 90, 24, 12, 56
 """Size of the plot and its margins in the units of the SVG."""
 
 
@@ -65,10 +64,13 @@ def _figures(result: FitResult) -> Iterable[tuple[str, str]]:
 
 
 def _settings(result: FitResult) -> Iterable[tuple[str, str]]:
-    for field in fields(result.settings):
-        value: Any = getattr(result.settings, field.name)
-        shown = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-        yield field.name.replace("_", " "), escape("as the preset has it" if value is None else shown)
+    for name, value in asdict(result.settings).items():
+        if value is None or (name in PAPER_SETTINGS and result.settings.preset != "paper"):
+            continue
+        yield (
+            name.replace("_", " "),
+            escape(", ".join(map(str, value)) if isinstance(value, tuple) else str(value)),
+        )
 
 
 def _bullets(lines: Sequence[str]) -> str:
@@ -114,10 +116,10 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
         at, label = f"{y(exponent):.1f}", f"{10.0**exponent:g}"
         parts.append(f'<line class="grid" x1="{CURVE_LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
         parts.append(f'<text x="{CURVE_LEFT - 8}" y="{at}" dy="4" text-anchor="end">{label}</text>')
-    for share in (0, 0.25, 0.5, 0.75, 1):
-        tick = seconds[-1] * share
-        below = CURVE_HEIGHT - CURVE_BOTTOM + 18
-        parts.append(f'<text x="{x(tick):.1f}" y="{below}" text-anchor="middle">{tick:.3g}</text>')
+    step = _round_step(seconds[-1] / 6)
+    for count in range(int(seconds[-1] / step) + 1):
+        place = f'x="{x(count * step):.1f}" y="{CURVE_HEIGHT - CURVE_BOTTOM + 22}"'
+        parts.append(f'<text {place} text-anchor="middle">{count * step:g}</text>')
     parts.append(f'<text x="{right}" y="{CURVE_HEIGHT - 6}" text-anchor="end">seconds</text>')
     line = " ".join(f"{x(time):.1f},{y(level):.1f}" for time, level in zip(seconds, levels, strict=True))
     parts.append(f'<polyline class="curve" points="{line}"/>')
@@ -129,3 +131,9 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
         f'<p>Estimated relMSE, logarithmic.</p><svg viewBox="0 0 {CURVE_WIDTH} {CURVE_HEIGHT}" role="img" '
         f'aria-label="Estimated relMSE over seconds">{"".join(parts)}</svg>'
     )
+
+
+def _round_step(least: float) -> float:
+    """Return the smallest of 1, 2 and 5 times a power of ten that is no less."""
+    power: float = 10.0 ** math.floor(math.log10(max(least, 1e-6)))
+    return next(step for step in (power, 2 * power, 5 * power, 10 * power) if step >= least)
