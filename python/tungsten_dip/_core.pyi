@@ -1,8 +1,8 @@
-"""The core in C++. Arrays are float32, C-contiguous, of shape (height, width, channels), and are never modified.
+"""The core in C++. Arrays are float32, C-contiguous, shape (height, width, channels), never modified.
 
 Every function raises TypeError for another dtype and ValueError for another shape or layout; none converts.
-Inputs are read in place, also read-only ones. The interpreter lock is released during long work. ``threads`` 0
-uses every core; no result depends on it.
+Inputs are read in place, also read-only ones. The interpreter lock is released during long work.
+``threads`` 0 uses every core; no result depends on it.
 """
 
 from tungsten_dip.buffers.model import FloatImage
@@ -22,9 +22,9 @@ class Defects:
 class HalvesTest:
     """Whether the noise of two half buffers is independent. Without arguments: nothing is known.
 
-    ``correlation`` is that of the halves' errors, ``variance_ratio`` the sample variance of the mean over the
-    variance between the halves (1 for independent samples); both are NaN where unknown. ``pixels_used`` went
-    into ``correlation``. ``independent`` is False as well where nothing in the image tells.
+    ``correlation`` is that of the halves' errors, ``variance_ratio`` the sample variance of the mean over
+    the variance between the halves (1 for independent samples); both are NaN where unknown. ``pixels_used``
+    went into ``correlation``. ``independent`` is False as well where nothing in the image tells.
     """
 
     def __init__(self) -> None: ...
@@ -48,7 +48,7 @@ def sanitize(
     tuple[FloatImage, FloatImage | None, FloatImage | None, FloatImage | None],
     tuple[Defects, Defects, Defects, Defects],
 ]:
-    """Return (mean, half_a, half_b, variance), mended copies of those with defects, and the defects of each."""
+    """Return (mean, half_a, half_b, variance), copied and mended if defective, and all defects."""
 
 def halves_variance(half_a: FloatImage, half_b: FloatImage, threads: int = 0) -> FloatImage:
     """Return (half_a - half_b)^2 / 4, an unbiased and very noisy estimate of the variance of the mean."""

@@ -10,9 +10,9 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     """Return buffers whose features are filtered by non-local means, each half with the other's weights.
 
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
-    Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it. Values
-    whose halves agree and whose variance is 0 pass through to the bit, and so do features without halves.
-    Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
+    Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it.
+    Values whose halves agree and whose variance is 0 pass through to the bit, and so do features without
+    halves. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:

@@ -13,9 +13,9 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     """Test whether the noise of the colour's halves is independent, as scoring one by the other assumes.
 
     Halves of a low-discrepancy sampler mirror each other (Tungsten's Sobol sampler: correlation -0.2), and
-    halves may be copies of one image. The correlation is taken of what a second-order difference leaves of both
-    halves; where texture makes it positive, the sample variance decides, if it is known. Without halves, and
-    where nothing in the image tells, ``independent`` is False. Expects sanitised buffers.
+    halves may be copies of one image. The correlation is taken of what a second-order difference leaves of
+    both halves; where texture makes it positive, the sample variance decides, if it is known. Without
+    halves, and where nothing in the image tells, ``independent`` is False. Expects sanitised buffers.
     """
     color = buffers.color
     if color.half_a is None or color.half_b is None:
@@ -24,10 +24,11 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
 
 
 def variance_of_mean(buffer: Buffer, threads: int | None = None) -> FloatImage | None:
-    """Estimate the variance of ``buffer.mean`` (same shape); None where neither halves nor variance are known.
+    """Estimate the variance of ``buffer.mean`` (same shape); None if neither halves nor variance are known.
 
-    With both, the sample variance is scaled to agree locally with the halves (Rousselle et al. 2012, "Adaptive
-    Rendering with Non-Local Means Filtering"); halves alone give an unbiased but very noisy estimate.
+    With both, the sample variance is scaled to agree locally with the halves (Rousselle et al. 2012,
+    "Adaptive Rendering with Non-Local Means Filtering"); halves alone give an unbiased but very noisy
+    estimate.
     """
     if buffer.half_a is None or buffer.half_b is None:
         return buffer.variance

@@ -1,0 +1,174 @@
+// Statistics against analytic values, and the test of independence against samplers whose answer is known.
+#include <cmath>
+#include <random>
+#include <utility>
+
+#include "check.hpp"
+#include "core.hpp"
+#include "pixels.hpp"
+
+using namespace tungsten_dip;
+
+namespace {
+
+using Generator = std::mt19937;
+
+double normal(Generator& generator) { return std::normal_distribution<>()(generator); }
+
+// Most samples are small, one in fifty is huge: the fireflies of a caustic.
+double firefly(Generator& generator) {
+    const double sample = std::exponential_distribution<>()(generator);
+    return std::uniform_real_distribution<>()(generator) < 0.02 ? 1000 * sample : sample;
+}
+
+// Every second sample mirrors the one before it in part, as low-discrepancy points do.
+auto mirrored(double strength) {
+    return [strength, last = 0.0, odd = false](Generator& generator) mutable {
+        const double fresh = normal(generator);
+        const double sample = odd ? -strength * last + std::sqrt(1 - strength * strength) * fresh : fresh;
+        last = fresh;
+        odd = !odd;
+        return sample;
+    };
+}
+
+void halves_variance_is_that_of_the_mean() {
+    Render render(64, 65, 8, 1, [](Generator& generator) { return 3 * normal(generator); });
+    Pixels out(64, 65, 1);
+    halves_variance(render.half_a.view(), render.half_b.view(), out.view(), 2);
+    CHECK(near(out.at(1, 2), std::pow(render.half_a.at(1, 2) - render.half_b.at(1, 2), 2) / 4, 1e-6));
+    double sum = 0;
+    for (const float value : out.values) sum += value;
+    const double count = static_cast<double>(out.values.size());
+    // The variance of 8 samples' mean is 9/8; the standard error of its estimate is sqrt(2 / count) of that.
+    CHECK(near(sum / count, 9.0 / 8, 4 * 9.0 / 8 * std::sqrt(2 / count)));
+}
+
+void box_mean_is_clipped_at_borders() {
+    Pixels ramp(1, 5, 2);
+    for (int x = 0; x < 5; ++x) ramp.at(0, x, 1) = static_cast<float>(x);
+    Pixels out(1, 5, 2, -1.0F);
+    box_mean(ramp.view(), 1, out.view(), 1);
+    CHECK(out.at(0, 0, 1) == 0.5F && out.at(0, 2, 1) == 2 && out.at(0, 4, 1) == 3.5F && out.at(0, 3, 0) == 0);
+
+    Pixels impulse(7, 6, 1);
+    impulse.at(3, 3) = 25;
+    Pixels spread(7, 6, 1);
+    box_mean(impulse.view(), 2, spread.view(), 3);
+    CHECK(near(spread.at(3, 3), 1, 1e-6) && near(spread.at(1, 3), 1.25, 1e-6) && spread.at(0, 3) == 0);
+    CHECK(near(spread.at(3, 5), 25.0 / 15, 1e-5));
+}
+
+void calibration_finds_the_scale() {
+    Render render(48, 47, 8, 2, normal);
+    for (float& value : render.variance.values) value *= 2.2F;  // as Sobol samples overstate it
+    Pixels out(48, 47, 1);
+    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), out.view(), 0);
+    double sum = 0;
+    for (const float value : out.values) sum += value;
+    CHECK(near(sum / static_cast<double>(out.values.size()), 1.0 / 8, 0.1 / 8));
+
+    Pixels clean(3, 3, 1);
+    Pixels flat(3, 3, 1, 1.0F);
+    Pixels result(3, 3, 1, -1.0F);
+    calibrate_variance(clean.view(), flat.view(), flat.view(), result.view(), 1);
+    CHECK(result == clean);
+}
+
+HalvesTest compare(Render& render, bool with_variance) {
+    return compare_halves(render.half_a.view(), render.half_b.view(),
+                          with_variance ? render.variance.view() : Image{}, 0);
+}
+
+void independent_halves_pass() {
+    Render plain(100, 99, 16, 3, normal);
+    Render heavy_tailed(100, 99, 16, 4, firefly);
+    for (Render* render : {&plain, &heavy_tailed}) {
+        for (const bool with_variance : {true, false}) {
+            const HalvesTest test = compare(*render, with_variance);
+            CHECK(test.independent);
+            CHECK(std::abs(test.correlation) < 0.1);
+            CHECK(test.pixels_used > 4000);
+            CHECK(std::isnan(test.variance_ratio) || near(test.variance_ratio, 1, 0.1));
+            CHECK(std::isnan(test.variance_ratio) == !with_variance);
+        }
+    }
+}
+
+void mirrored_halves_fail() {
+    for (const double strength : {0.2, 0.6}) {
+        Render render(128, 130, 16, 5, mirrored(strength));
+        const HalvesTest test = compare(render, true);
+        CHECK(near(test.correlation, -strength, 0.1));
+        CHECK(!test.independent);
+        CHECK(!compare(render, false).independent);
+    }
+}
+
+void shared_samples_fail() {
+    Render render(100, 99, 16, 6, mirrored(-0.5));
+    CHECK(near(compare(render, true).correlation, 0.5, 0.1));
+    CHECK(!compare(render, true).independent);
+
+    Render same(100, 99, 16, 7, normal);
+    same.half_b = same.half_a;
+    for (const bool with_variance : {true, false}) {
+        CHECK(compare(same, with_variance).correlation == 1);
+        CHECK(!compare(same, with_variance).independent);
+    }
+}
+
+void texture_is_no_correlation() {
+    Render render(100, 99, 16, 8, normal);
+    Generator generator(9);  // NOLINT(bugprone-random-generator-seed): tests repeat
+    for (int y = 0; y < 100; ++y) {
+        for (int x = 0; x < 99; ++x) {
+            const auto detail = static_cast<float>(10 * std::abs(normal(generator)));
+            render.half_a.at(y, x) += detail;
+            render.half_b.at(y, x) += detail;
+        }
+    }
+    const HalvesTest test = compare(render, true);
+    CHECK(test.correlation > 0.9);
+    CHECK(test.independent);
+    CHECK(!compare(render, false).independent);  // nobody can tell without the variance
+}
+
+void nothing_to_see_is_not_independent() {
+    for (const auto& [height, width] : {std::pair{1, 1}, std::pair{1, 50}, std::pair{50, 1}, std::pair{0, 0},
+                                        std::pair{0, 5}, std::pair{5, 0}, std::pair{3, 3}}) {
+        Render render(height, width, 4, 10, normal);
+        const HalvesTest test = compare(render, true);
+        CHECK(!test.independent && std::isnan(test.correlation) && test.pixels_used == 0);
+    }
+    Render flat(50, 50, 4, 11, [](Generator&) { return 0.0; });
+    CHECK(!compare(flat, true).independent && std::isnan(compare(flat, true).variance_ratio));
+}
+
+void threads_do_not_matter() {
+    Render render(67, 43, 8, 12, firefly);
+    const auto run = [&](int threads) {
+        return compare_halves(render.half_a.view(), render.half_b.view(), render.variance.view(), threads);
+    };
+    CHECK(run(1).correlation == run(5).correlation && run(1).variance_ratio == run(5).variance_ratio);
+    Pixels one(67, 43, 1);
+    Pixels many(67, 43, 1);
+    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), one.view(), 1);
+    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), many.view(), 5);
+    CHECK(one == many);
+}
+
+}  // namespace
+
+int main() {
+    halves_variance_is_that_of_the_mean();
+    box_mean_is_clipped_at_borders();
+    calibration_finds_the_scale();
+    independent_halves_pass();
+    mirrored_halves_fail();
+    shared_samples_fail();
+    texture_is_no_correlation();
+    nothing_to_see_is_not_independent();
+    threads_do_not_matter();
+    return failed_checks();
+}
