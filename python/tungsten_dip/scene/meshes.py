@@ -291,7 +291,7 @@ def _mesh_from_obj(path: Path, content: bytes) -> TriangleMesh:
             index_of_token[token] = found
         return found
 
-    for number, line in enumerate(content.decode("latin-1").splitlines(), 1):
+    for number, line in enumerate(content.decode("latin-1").split("\n"), 1):
         kind, *words = line.split() or [""]
         kind = kind.lower()
         if kind in tables:
