@@ -112,13 +112,15 @@ def _json_from_file(path: Path) -> dict[str, Any]:
     if text is None:
         raise InputError(f"{path}: expected a Tungsten scene file, found none; check the path")
 
+    repeated: set[str] = set()
+
     def first_of_equal_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        fields = dict(reversed(pairs))
-        if len(fields) < len(pairs):
-            twice = [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]
-            logger.warning(
-                "%s: the key %s appears twice in one object; the first is used", path, _short(twice[0])
-            )
+        fields: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in fields:
+                repeated.add(key)
+            else:
+                fields[key] = value
         return fields
 
     try:
@@ -136,6 +138,9 @@ def _json_from_file(path: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(raw, dict):
         raise InputError(f"{path}: expected a JSON object with primitives and a camera, got {_short(raw)}")
+    if repeated:
+        listed = ", ".join(sorted(_short(key) for key in repeated))
+        logger.warning("%s: keys that appear twice in one object, the first is used: %s", path, listed[:500])
     return raw
 
 
