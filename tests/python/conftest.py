@@ -11,7 +11,7 @@ import pytest
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 
 SAMPLE_SHAPE = 0.5
-"""A sample is gamma distributed with this shape around the true radiance: its variance is radiance^2 / shape."""
+"""Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ MakeRender = Callable[..., SyntheticRender]
 
 @pytest.fixture
 def make_render() -> MakeRender:
-    """``make_render(height=40, width=56, spp=16, seed=0)``: a lit sphere on a checkered floor before a sky."""
+    """``make_render(height=40, width=56, spp=16, seed=0)``: a sphere on a checkered floor before a sky."""
     return _make_render
 
 

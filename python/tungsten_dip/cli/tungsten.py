@@ -58,6 +58,8 @@ def denoise_outputs(
     write_image(pair, side_by_side(noisy, denoised))
     if report is not None:
         write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
+    for written in filter(None, (exr, png, pair, report)):
+        log.info("wrote %s", written)
 
 
 def _run(arguments: Sequence[str] | None) -> None:

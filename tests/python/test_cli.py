@@ -1,0 +1,500 @@
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import OpenImageIO
+import pytest
+
+import tungsten_dip
+from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
+from tungsten_dip.cli import tungsten
+from tungsten_dip.cli import tungsten_dip as command
+from tungsten_dip.cli.console import duration, minutes
+from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.progress import silent
+
+SCENE = {
+    "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
+    "primitives": [
+        {"type": "quad", "bsdf": "grey", "transform": {"scale": 4}},
+        {"type": "infinite_sphere", "emission": [0.5, 0.7, 1.0]},
+    ],
+    "camera": {
+        "type": "pinhole",
+        "tonemap": "filmic",
+        "resolution": [17, 9],
+        "fov": 45,
+        "transform": {"position": [0, 2, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]},
+    },
+    "integrator": {"type": "path_tracer", "max_bounces": 2},
+    "renderer": {
+        "output_file": "picture.png",
+        "hdr_output_file": "picture.exr",
+        "spp": 4,
+        "output_buffers": [
+            {
+                "type": "normal",
+                "hdr_output_file": "n.exr",
+                "ldr_output_file": "n.png",
+                "two_buffer_variance": True,
+                "sample_variance": True,
+            },
+            {"type": "depth", "hdr_output_file": "z.pfm"},
+        ],
+    },
+}
+
+MAIN = "import sys; from tungsten_dip.cli.{} import main; sys.exit(main())"
+"""What the installed commands do."""
+
+
+def write_scene(path, **renderer):
+    scene = {**SCENE, "renderer": {**SCENE["renderer"], **renderer}}
+    path.write_text(json.dumps(scene))
+    return path
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_scene(tmp_path / "scene.json")
+
+
+@pytest.fixture
+def folder(tmp_path, render):
+    write_tungsten_folder(tmp_path / "buffers", render.buffers)
+    return tmp_path / "buffers"
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """Replaces the fit by its mean colour; lists the settings that it was called with."""
+    calls = []
+
+    def denoise(buffers, settings=None, progress=silent):
+        settings = settings or FitSettings()
+        calls.append(settings)
+        os.write(1, b"a library that chatters on stdout\n")
+        progress(0.5, "halfway")
+        color = np.broadcast_to(buffers.color.mean.mean((0, 1)), buffers.color.mean.shape).copy()
+        error = np.full((buffers.height, buffers.width, 1), 0.25, np.float32)
+        known = buffers.color.has_halves
+        return FitResult(
+            color=color,
+            settings=settings,
+            seconds=1.5,
+            iterations=7,
+            error=error if known else None,
+            estimated_relmse=0.25 if known else None,
+            history=(HistoryPoint(0.5, 3, 0.5), HistoryPoint(1.5, 7, 0.25)),
+        )
+
+    monkeypatch.setattr("tungsten_dip.fit.denoise", denoise, raising=False)
+    return calls
+
+
+@pytest.fixture
+def renders(monkeypatch, make_render):
+    """Replaces Mitsuba by the synthetic render; lists what it was asked for."""
+    calls = []
+
+    def render(scene, *, spp, seed, threads, timeout_s, progress, quantities):
+        calls.append({"spp": spp, "seed": seed, "timeout_s": timeout_s, "quantities": quantities})
+        width, height = scene.camera.resolution
+        buffers = make_render(height, width, seed=seed).buffers
+        unwanted = {"albedo", "normal", "depth"}.difference(quantities)
+        return buffers.with_quantities(**dict.fromkeys(unwanted))
+
+    monkeypatch.setattr("tungsten_dip.hosts.mitsuba.render.render", render)
+    monkeypatch.setattr("tungsten_dip.hosts.tungsten.available", lambda: False)
+    return calls
+
+
+def fails(capfd, status, *words):
+    """Assert that exactly one line was said, that it holds the words, and that stdout stayed empty."""
+    out, err = capfd.readouterr()
+    assert status == 2
+    assert out == ""
+    lines = [line for line in err.splitlines() if line.startswith(("tungsten-dip: ", "tungsten: "))]
+    assert lines, err
+    assert "Traceback" not in err
+    assert all(str(word) in lines[-1] for word in words), lines[-1]
+
+
+# --- tungsten-dip denoise ---------------------------------------------------------------------------
+
+
+def test_denoise_writes_every_file_asked_for(folder, tmp_path, fits, render, capfd):
+    out, error, report = tmp_path / "out.exr", tmp_path / "error.exr", tmp_path / "report.html"
+    arguments = ["denoise", folder, "-o", out, "--error-map", error, "--report", report]
+    assert command.main(list(map(str, arguments))) == 0
+    mean = render.buffers.color.mean.mean((0, 1))
+    np.testing.assert_allclose(read_image(out), np.broadcast_to(mean, (40, 56, 3)), rtol=1e-6)
+    np.testing.assert_array_equal(read_image(error), np.full((40, 56, 3), 0.25, np.float32))
+    assert "estimated relMSE" in report.read_text()
+
+
+def test_json_is_all_there_is_on_stdout(folder, tmp_path, fits, capfd):
+    assert command.main(["denoise", str(folder), "-o", str(tmp_path / "out.exr"), "--json"]) == 0
+    out, err = capfd.readouterr()
+    facts = json.loads(out)
+    assert facts["iterations"] == 7
+    assert facts["history"][0] == {"seconds": 0.5, "iteration": 3, "estimated_relmse": 0.5}
+    assert "chatters" in err
+
+
+def test_options_become_settings(folder, tmp_path, fits):
+    given = (
+        "--preset paper --iterations 12 --time-budget 1.5m --target-error 0.01 --seed 3 --device cpu "
+        "--threads 1 --network resnet --inputs normals --scheme ioc --channels 4,8"
+    )
+    assert command.main(["denoise", str(folder), "-o", str(tmp_path / "out.exr"), *given.split()]) == 0
+    assert fits == [FitSettings("paper", 12, 90.0, 0.01, "resnet", "normals", "ioc", (4, 8), 3, "cpu", 1)]
+
+
+def test_denoise_again_from_its_own_output(folder, tmp_path, fits, capfd):
+    first, second = str(tmp_path / "first.exr"), str(tmp_path / "second.exr")
+    assert command.main(["denoise", str(folder), "-o", first]) == 0
+    assert command.main(["denoise", first, "-o", second]) == 0
+    np.testing.assert_array_equal(read_image(tmp_path / "first.exr"), read_image(tmp_path / "second.exr"))
+
+
+def test_half_floats(folder, tmp_path, fits):
+    assert command.main(["denoise", str(folder), "-o", str(tmp_path / "out.exr"), "--half"]) == 0
+    spec = OpenImageIO.ImageInput.open(str(tmp_path / "out.exr")).spec()
+    assert str(spec.channelformat(spec.channelindex("R"))) == "half"
+
+
+def test_an_error_map_that_cannot_be_known_is_not_silently_left_out(tmp_path, fits, render, capfd):
+    write_tungsten_folder(tmp_path / "buffers", RenderBuffers(Buffer(render.buffers.color.mean)))
+    out, error = tmp_path / "out.exr", tmp_path / "error.exr"
+    status = command.main(["denoise", str(tmp_path / "buffers"), "-o", str(out), "--error-map", str(error)])
+    assert status == 2
+    assert out.exists()
+    assert not error.exists()
+    assert str(error) in capfd.readouterr().err
+
+
+def test_values_that_are_not_finite_are_mended_before_the_fit(tmp_path, fits, render, capfd):
+    color = render.buffers.color.mean.copy()
+    color[3, 4] = np.nan
+    write_tungsten_folder(tmp_path / "buffers", RenderBuffers(Buffer(color)))
+    assert command.main(["denoise", str(tmp_path / "buffers"), "-o", str(tmp_path / "out.exr")]) == 0
+    assert np.isfinite(read_image(tmp_path / "out.exr")).all()
+    assert "3 NaN" in capfd.readouterr().err
+
+
+def truncated(folder):
+    path = folder / "color.exr"
+    path.write_bytes(path.read_bytes()[:-500])
+    return path
+
+
+def of_another_size(folder):
+    write_image(folder / "normal.exr", np.zeros((3, 4, 3), np.float32))
+    return folder
+
+
+def without_color(folder):
+    for path in folder.glob("color*.exr"):
+        path.unlink()
+    return folder
+
+
+def emptied(folder):
+    for path in folder.iterdir():
+        path.unlink()
+    return folder
+
+
+@pytest.mark.parametrize("spoil", [truncated, of_another_size, without_color, emptied])
+def test_bad_buffers(spoil, folder, tmp_path, fits, capfd):
+    culprit = spoil(folder)
+    out = tmp_path / "out.exr"
+    fails(capfd, command.main(["denoise", str(folder), "-o", str(out)]), culprit)
+    assert not out.exists()
+    assert not fits
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("{folder}x -o {tmp}/out.exr", ["{folder}x", "no such file"]),
+        ("{folder} -o {tmp}/none/out.exr", ["{tmp}/none/out.exr", "cannot be written"]),
+        ("{folder} -o {tmp}", ["{tmp}"]),
+        ("{folder} -o {tmp}/out.png", ["{tmp}/out.png", ".exr"]),
+        ("{folder} -o {tmp}/out.exr --report {tmp}/none/r.html", ["{tmp}/none/r.html"]),
+        ("{folder} -o {tmp}/out.exr --error-map {tmp}/none/e.exr", ["{tmp}/none/e.exr"]),
+        ("{folder} -o {tmp}/out.exr --time-budget soon", ["--time-budget", "90s", "soon"]),
+        ("{folder} -o {tmp}/out.exr --time-budget 0", ["time_budget_s"]),
+        ("{folder} -o {tmp}/out.exr --iterations -1", ["iterations"]),
+        ("{folder} -o {tmp}/out.exr --target-error nan", ["target_error"]),
+        ("{folder} -o {tmp}/out.exr --network resnet", ["--network", "--preset paper"]),
+        ("{folder} -o {tmp}/out.exr --preset paper --channels 8,x", ["--channels", "8,16"]),
+        ("{folder} -o {tmp}/out.exr --map color", ["--map", "NAME=CHANNEL"]),
+        ("{folder} -o {tmp}/out.exr --map beauty=x", ["beauty"]),
+        ("{folder} -o {tmp}/out.exr --prese draft", ["--prese"]),
+        ("{folder}", ["-o/--output"]),
+        ("", ["INPUT"]),
+    ],
+)
+def test_bad_arguments(arguments, words, folder, tmp_path, fits, capfd):
+    places = {"folder": folder, "tmp": tmp_path}
+    before = sorted(tmp_path.rglob("*"))
+    status = command.main(["denoise", *arguments.format(**places).split()])
+    fails(capfd, status, *(word.format(**places) for word in words))
+    assert sorted(tmp_path.rglob("*")) == before
+    assert not fits
+
+
+def test_no_command_is_an_error(capfd):
+    fails(capfd, command.main([]), "COMMAND")
+
+
+# --- tungsten-dip inspect and compare ---------------------------------------------------------------
+
+
+def test_inspect_a_scene(scene, capfd):
+    assert command.main(["inspect", str(scene), "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert (facts["width"], facts["height"]) == (17, 9)
+    assert command.main(["inspect", str(scene)]) == 0
+    assert "depth of field" in capfd.readouterr().out
+
+
+def test_inspect_buffers(folder, capfd):
+    assert command.main(["inspect", str(folder), "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert (facts["width"], facts["height"], facts["spp"]) == (56, 40, 16)
+    assert facts["quantities"]["color"] == {
+        "planes": ["mean", "half_a", "half_b", "variance"],
+        "nonfinite": 0,
+    }
+    assert "visibility" not in facts["quantities"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", ["not JSON"]),
+        ('{"primitives": [{"type": "quad", "bsdf": {"type": "velvet"}}]}', ["velvet"]),
+        ("[1, 2]", []),
+    ],
+)
+def test_bad_scenes(text, words, tmp_path, capfd, renders):
+    path = tmp_path / "scene.json"
+    path.write_text(text)
+    fails(capfd, command.main(["inspect", str(path)]), path)
+    fails(capfd, tungsten.main([str(path)]), path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_compare(tmp_path, render, capfd):
+    image, reference = tmp_path / "image.exr", tmp_path / "reference.pfm"
+    write_image(image, render.buffers.color.mean)
+    write_image(reference, render.reference)
+    assert command.main(["compare", str(image), str(reference), "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    expected = tungsten_dip.compare(render.buffers.color.mean, render.reference)
+    assert facts["psnr"] == pytest.approx(expected.psnr)
+    assert set(facts) == {"psnr", "relmse", "ssim", "flip", "hdrflip", "nonfinite", "mean_ratio"}
+
+
+def test_json_has_no_infinity(tmp_path, render, capfd):
+    image = tmp_path / "image.exr"
+    write_image(image, render.reference)
+    assert command.main(["compare", str(image), str(image), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out, parse_constant=pytest.fail)["psnr"] is None
+
+
+def test_compare_images_of_two_sizes(tmp_path, capfd):
+    image, reference = tmp_path / "image.exr", tmp_path / "reference.exr"
+    write_image(image, np.ones((4, 5, 3), np.float32))
+    write_image(reference, np.ones((5, 4, 3), np.float32))
+    fails(capfd, command.main(["compare", str(image), str(reference)]), "(4, 5, 3)", "(5, 4, 3)")
+
+
+# --- tungsten ---------------------------------------------------------------------------------------
+
+
+def test_a_render_writes_what_the_scene_asks_for(scene, tmp_path, renders):
+    assert tungsten.main([str(scene)]) == 0
+    names = {path.name for path in tmp_path.iterdir()} - {"scene.json"}
+    normals = {f"n{plane}{suffix}" for plane in ("", "A", "B", "Variance") for suffix in (".exr", ".png")}
+    assert names == {"picture.png", "picture.exr", "z.pfm"} | normals
+    assert renders == [
+        {"spp": None, "seed": 0, "timeout_s": None, "quantities": ["color", "normal", "depth"]}
+    ]
+    width, height = SCENE["camera"]["resolution"]
+    assert read_image(tmp_path / "picture.exr").shape == (height, width, 3)
+
+
+def test_denoised_pictures_lie_beside_the_noisy_ones(tmp_path, renders, fits, capfd):
+    scene = write_scene(tmp_path / "scene.json", hdr_output_file="", output_buffers=[])
+    report = tmp_path / "page.html"
+    options = (
+        f"--dip-denoise --dip-preset draft --dip-time-budget 5 --dip-report {report} --spp 8 -s 3 --timeout 2"
+    )
+    assert tungsten.main([*options.split(), "-d", str(tmp_path / "new" / "out"), str(scene)]) == 0
+    assert {path.name for path in (tmp_path / "new" / "out").iterdir()} == {
+        "picture.png",
+        "picture.exr",
+        "picture_denoised.exr",
+        "picture_denoised.png",
+        "picture_side_by_side.png",
+    }
+    assert fits == [FitSettings("draft", time_budget_s=5.0)]
+    (asked,) = renders
+    assert (asked["spp"], asked["seed"], asked["timeout_s"]) == (8, 3, 120.0)
+    assert {"color", "normal", "depth"} <= set(asked["quantities"])
+    assert "picture" in report.read_text()
+    assert capfd.readouterr().err.count("wrote ") == 6
+
+
+def test_output_files_of_the_command_line(scene, tmp_path, renders, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    assert tungsten.main(["-o", "sub/a.png", "-e", "sub/b.pfm", str(scene)]) == 0
+    assert {path.name for path in (tmp_path / "sub").iterdir()} == {"a.png", "b.pfm"}
+    assert not (tmp_path / "picture.png").exists()
+
+
+def test_files_are_numbered_where_the_scene_forbids_overwriting(tmp_path, renders):
+    scene = write_scene(tmp_path / "scene.json", overwrite_output_files=False, output_buffers=[])
+    for _ in range(3):
+        assert tungsten.main([str(scene)]) == 0
+    assert {path.name for path in tmp_path.glob("picture*")} == {
+        f"picture{number}{suffix}" for number in ("", "001", "002") for suffix in (".png", ".exr")
+    }
+
+
+def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
+    tmp_path, renders, fits, capfd, monkeypatch
+):
+    scenes = [
+        write_scene(
+            tmp_path / f"{name}.json", output_file=f"{name}.png", hdr_output_file="", output_buffers=[]
+        )
+        for name in ("one", "two", "three")
+    ]
+    finished = tungsten_dip.fit.denoise
+
+    def interrupted(buffers, settings, progress):
+        if fits:
+            raise KeyboardInterrupt
+        return finished(buffers, settings, progress)
+
+    monkeypatch.setattr("tungsten_dip.fit.denoise", interrupted)
+    assert tungsten.main(["--dip-denoise", *map(str, scenes)]) == 130
+    names = {path.name for path in tmp_path.iterdir()} - {path.name for path in scenes}
+    assert names == {
+        "one.png",
+        "one.exr",
+        "one_denoised.exr",
+        "one_denoised.png",
+        "one_side_by_side.png",
+        "two.png",
+        "two.exr",
+    }
+    assert capfd.readouterr().err.splitlines()[-1] == "tungsten: interrupted"
+
+
+def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_path, renders, capfd):
+    broken = tmp_path / "broken.json"
+    broken.write_text("{")
+    assert tungsten.main([str(broken), str(scene)]) == 2
+    assert (tmp_path / "picture.png").exists()
+    err = capfd.readouterr().err
+    assert str(broken) in err
+    assert err.splitlines()[-1] == "tungsten: 1 of 2 scenes failed, see above"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--dip-preset draft {scene}", ["--dip-denoise"]),
+        ("--dip-denoise --dip-report {tmp}/none/r.html {scene}", ["{tmp}/none/r.html"]),
+        ("--dip-denoise --dip-report {tmp}/r.html {scene} {scene}", ["one at a time"]),
+        ("-o {tmp}/a.png {scene} {scene}", ["one at a time"]),
+        ("-o {tmp}/none/a.png {scene}", ["{tmp}/none/a.png"]),
+        ("-o {tmp}/a.jpg {scene}", ["{tmp}/a.jpg", ".png"]),
+        ("-c 10m {scene}", ["--checkpoint", "--host tungsten"]),
+        ("--timeout x {scene}", ["--timeout"]),
+        ("{tmp}/none.json", ["{tmp}/none.json"]),
+        ("--nonsense {scene}", ["--nonsense"]),
+    ],
+)
+def test_bad_options(arguments, words, scene, tmp_path, renders, fits, capfd):
+    places = {"scene": scene, "tmp": tmp_path}
+    status = tungsten.main(arguments.format(**places).split())
+    fails(capfd, status, *(word.format(**places) for word in words))
+    assert list(tmp_path.iterdir()) == [scene]
+    assert not renders
+
+
+def test_help_without_a_scene(capfd):
+    assert tungsten.main([]) == 0
+    assert "--dip-denoise" in capfd.readouterr().out
+
+
+def test_a_render_by_mitsuba_and_a_fit(tmp_path):
+    scene = write_scene(tmp_path / "scene.json", output_buffers=[])
+    options = ["--host", "mitsuba", "--dip-denoise", "--dip-preset=draft", "--dip-time-budget=1s", "-t1"]
+    program = [sys.executable, "-c", MAIN.format("tungsten"), *options, str(scene)]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    noisy, denoised = read_image(tmp_path / "picture.exr"), read_image(tmp_path / "picture_denoised.exr")
+    assert noisy.shape == denoised.shape == (9, 17, 3)
+    assert np.isfinite(denoised).all()
+    assert denoised.mean() == pytest.approx(noisy.mean(), rel=0.5)
+
+
+# --- Exit statuses and durations --------------------------------------------------------------------
+
+
+def test_an_internal_error_is_one_line_and_a_traceback_only_on_demand(folder, tmp_path, monkeypatch, capfd):
+    def broken(buffers, settings, progress):
+        raise RuntimeError("a bug\nin two lines")
+
+    monkeypatch.setattr("tungsten_dip.fit.denoise", broken, raising=False)
+    arguments = ["denoise", str(folder), "-o", str(tmp_path / "out.exr")]
+    assert command.main(arguments) == 1
+    last = capfd.readouterr().err.splitlines()[-1]
+    assert last.startswith("tungsten-dip: internal error: RuntimeError: a bug in two lines")
+    monkeypatch.setenv("TUNGSTEN_DIP_DEBUG", "1")
+    with pytest.raises(RuntimeError, match="a bug"):
+        command.main(arguments)
+
+
+def test_a_missing_part_of_the_package_is_named(tmp_path, monkeypatch, capfd):
+    write_image(tmp_path / "image.exr", np.linspace(0, 1, 9 * 9 * 3, dtype=np.float32).reshape(9, 9, 3))
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    image = str(tmp_path / "image.exr")
+    fails(capfd, command.main(["compare", image, image]), "pip install 'tungsten-dip[compare]'")
+
+
+def test_a_reader_that_stops_early_is_no_error(scene):
+    script = f"{sys.executable} -c '{MAIN.format('tungsten_dip')}' inspect {scene} | head -c 1"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert len(done.stdout) == 1
+    assert "rror" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90s", 90), ("5m", 300), ("1.5h", 5400), ("1h30m", 5400), ("250ms", 0.25), ("2 m", 120), ("45", 45)],
+)
+def test_durations(text, seconds):
+    assert duration(text) == pytest.approx(seconds)
+
+
+def test_a_bare_number_means_minutes_to_tungsten():
+    assert minutes("2") == 120
+    assert minutes("2s") == 2
+
+
+@pytest.mark.parametrize("text", ["", "soon", "-5s", "5x", "5s later", "s", "1e3", "nan"])
+def test_texts_that_are_no_duration(text):
+    with pytest.raises(Exception, match="expected a duration"):
+        duration(text)

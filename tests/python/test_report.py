@@ -1,0 +1,130 @@
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tungsten_dip.buffers import Buffer, RenderBuffers
+from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.report.page import report_page
+from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, error_in_false_color, side_by_side
+
+VOID = {"meta", "img", "input", "line", "circle", "polyline", "link", "br"}
+
+
+class Page(HTMLParser):
+    """Checks that tags are closed in order; keeps elements by tag and the text."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.elements, self.text = [], [], ""
+        self.feed(html)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture
+def result(render):
+    return FitResult(
+        color=render.reference,
+        settings=FitSettings(),
+        seconds=12.3,
+        iterations=400,
+        error=np.full((40, 56, 1), 0.04, np.float32),
+        estimated_relmse=0.04,
+        history=tuple(HistoryPoint(i * 1.5, i * 50, 0.5 / i) for i in range(1, 9)),
+        notes=("no visibility: fitted without <it>",),
+    )
+
+
+def test_the_page_shows_everything_and_needs_no_network(render, result):
+    html = report_page("A <b>room</b>", render.buffers, result, "filmic", ["mended 3 NaN"])
+    page = Page(html)
+    images = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
+    assert set(images) == {"noisy", "denoised", "estimated error"}
+    assert all(source.startswith("data:image/png;base64,iVBOR") for source in images.values())
+    assert images["noisy"] != images["denoised"]
+    assert not re.search(r"https?://|@import|<script", html)
+    for words in (
+        "A <b>room</b>",
+        "12.3 s",
+        "0.04",
+        "mended 3 NaN",
+        "fitted without <it>",
+        "56 x 40",
+        "16 samples",
+    ):
+        assert words in page.text
+
+
+def test_the_curve_goes_through_every_point(render, result):
+    page = Page(report_page("room", render.buffers, result, "gamma"))
+    (line,) = (attributes["points"] for tag, attributes in page.elements if tag == "polyline")
+    x, y = np.array([point.split(",") for point in line.split()], dtype=float).T
+    seconds = [point.seconds for point in result.history]
+    levels = [np.log10(point.estimated_relmse) for point in result.history]
+    assert len(x) == len(result.history)
+    # Affine in time and in the logarithm of the error, which falls while y grows downwards.
+    np.testing.assert_allclose(np.polyval(np.polyfit(seconds, x, 1), seconds), x, atol=0.2)
+    np.testing.assert_allclose(np.polyval(np.polyfit(levels, y, 1), levels), y, atol=0.2)
+    assert np.all(np.diff(y) > 0)
+
+
+def test_what_is_not_known_is_said_and_not_drawn(render):
+    buffers = RenderBuffers(Buffer(render.buffers.color.mean))
+    fitted = FitResult(render.reference, FitSettings(), 1.0, 10, history=(HistoryPoint(1.0, 10, None),))
+    page = Page(report_page("room", buffers, fitted, "gamma"))
+    tags = [tag for tag, _ in page.elements]
+    assert tags.count("img") == 2
+    assert "svg" not in tags
+    assert "the error was not estimated" in page.text
+    assert "the colour alone" in page.text
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 7)])
+def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
+    small = make_render(height, width)
+    color = small.reference.copy()
+    color[0, 0] = (np.nan, np.inf, -1)
+    error = np.full((height, width, 1), np.nan, np.float32)
+    history = (HistoryPoint(0.0, 1, 0.1), HistoryPoint(0.0, 2, 0.1))
+    fitted = FitResult(color, FitSettings("paper"), 0.0, 2, error, 0.1, history)
+    page = Page(report_page("small", small.buffers, fitted, "reinhard"))
+    assert "all+random" in page.text
+    assert "nan" not in page.text
+
+
+def test_side_by_side_keeps_both_pictures():
+    left, right = np.zeros((3, 5, 3), np.float32), np.full((3, 5, 3), 0.5, np.float32)
+    pair = side_by_side(left, right)
+    assert pair.shape == (3, 5 + GAP_PX + 5, 3)
+    np.testing.assert_array_equal(pair[:, :5], left)
+    np.testing.assert_array_equal(pair[:, 5:-5], 1)
+    np.testing.assert_array_equal(pair[:, -5:], right)
+
+
+def test_false_colors_run_from_none_to_the_99th_percentile():
+    relative = np.linspace(0, 0.5, 1000, dtype=np.float32)
+    picture, most = error_in_false_color((relative**2).reshape(20, 50, 1))
+    assert most == pytest.approx(np.percentile(relative, 99), rel=1e-3)
+    np.testing.assert_allclose(picture[0, 0] * 255, FALSE_COLORS[0], atol=0.01)
+    np.testing.assert_allclose(picture[-1, -1] * 255, FALSE_COLORS[-1], atol=0.01)
+    luminance = picture.reshape(-1, 3) @ [0.2126, 0.7152, 0.0722]
+    assert np.all(np.diff(luminance) >= -1e-6)
+
+
+def test_no_error_at_all_is_dark():
+    picture, most = error_in_false_color(np.zeros((2, 3, 1), np.float32))
+    assert most == 1
+    np.testing.assert_allclose(picture * 255, np.broadcast_to(FALSE_COLORS[0], (2, 3, 3)), atol=0.01)
