@@ -773,8 +773,8 @@ class ThinlensCamera(Camera):
     """Depth of field. ``fov`` is horizontal; ``aperture_size`` is the radius of the lens.
 
     ``focus_distance`` is measured along the axis; where ``focus_pivot`` names a primitive, it is the distance
-    to that. Unlike the pinhole, Tungsten's thin lens samples pixel (x, y) about its upper left corner, not
-    its middle: its picture is half a pixel off.
+    to that. Tungsten's thin lens samples a pixel about its upper left corner, not about its middle as the
+    pinhole does: everything stands half a pixel further right and further down.
     """
 
     kind: ClassVar[str] = "thinlens"
