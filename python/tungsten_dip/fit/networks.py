@@ -10,6 +10,7 @@ the input alike).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -130,7 +131,50 @@ class _NormAct(_Norm):
     """Batch norm, then leaky ReLU in place."""
 
     def forward(self, x: Tensor) -> Tensor:
+        # torch's batch norm crawls where few channels lie last in memory.
+        few_last = x.shape[1] < 16 and x.permute(0, 2, 3, 1).is_contiguous()
+        if few_last and x.requires_grad and x.device.type == "cpu":
+            return cast(Tensor, _NormActOfRows.apply(x, self.weight, self.bias, self.eps))
         return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
+
+
+class _NormActOfRows(torch.autograd.Function):
+    """Norm and leaky ReLU of an image with channels last, as a matrix of its rows of pixels."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
+        """Take and return (batch, channels, height, width)."""
+        width = x.shape[3]
+        rows = x.permute(0, 2, 3, 1).flatten(2).flatten(0, 1)
+        offset = rows - _row_mean(rows, width).repeat(width)
+        inverse_std = torch.rsqrt(_row_mean(offset * offset, width) + eps)
+        y = torch.addcmul(bias.repeat(width), offset, (weight * inverse_std).repeat(width))
+        F.leaky_relu_(y, LEAKY_SLOPE)
+        ctx.save_for_backward(offset, y, weight, inverse_std)
+        return y.view(x.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:  # type: ignore[override]
+        """Return the gradients of x, weight and bias."""
+        offset, y, weight, inverse_std = ctx.saved_tensors
+        width = grad.shape[3]
+        g = torch.ops.aten.leaky_relu_backward(
+            grad.permute(0, 2, 3, 1).reshape(y.shape), y, LEAKY_SLOPE, True
+        )
+        mean_g = _row_mean(g, width)
+        mean_g_normal = _row_mean(g * offset, width) * inverse_std
+        scale = weight * inverse_std
+        dx = torch.addcmul(
+            (-scale * mean_g).repeat(width), offset, (-scale * inverse_std * mean_g_normal).repeat(width)
+        ).addcmul_(g, scale.repeat(width))
+        pixels = grad.numel() // grad.shape[1]
+        shape = grad.permute(0, 2, 3, 1).shape
+        return dx.view(shape).permute(0, 3, 1, 2), mean_g_normal * pixels, mean_g * pixels, None
+
+
+def _row_mean(rows: Tensor, width: int) -> Tensor:
+    """Mean of every channel of (rows, width * channels); long rows first, for that is what runs fast."""
+    return rows.mean(0).view(width, -1).mean(0)
 
 
 class _Down(nn.Sequential):
@@ -184,14 +228,10 @@ class _Up(nn.Module):
 
     def _phases(self, coarse: Tensor) -> Tensor:
         """Equal ``conv(norm(upsample(coarse)))``, in the order of pixels that `_image_from_phases` undoes."""
-        batch, channels, height, width = coarse.shape
+        batch, _, height, width = coarse.shape
         edged = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
 
-        # Upsampling U keeps the mean; the mean square of Ux is that of x with x blurred by U'U.
-        mean = _pixel_mean(coarse)
-        offset = coarse - mean[:, None, None]
-        blurred = F.conv2d(edged, self.blur.expand(channels, 1, 3, 3), groups=channels) - mean[:, None, None]
-        variance = _pixel_mean(offset * blurred)
+        mean, variance = _UpsampledMoments.apply(coarse, self.blur)
 
         # The norm is affine, so it goes into the weights.
         scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
@@ -201,6 +241,32 @@ class _Up(nn.Module):
         kernel = kernel.unflatten(2, (4, 3, 3)).permute(2, 0, 1, 3, 4).flatten(0, 1)
         y = F.conv2d(edged, kernel.contiguous(memory_format=torch.channels_last), bias.repeat(4))
         return y.permute(0, 2, 3, 1).reshape(batch, height, width * 4, -1).permute(0, 3, 1, 2)
+
+
+class _UpsampledMoments(torch.autograd.Function):
+    """Mean and variance of each channel of the upsampled image, without upsampling.
+
+    Upsampling U keeps the mean, and the mean square of U x is the mean of x times x blurred by U'U.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
+        """Take (batch, channels, height, width), return two vectors over channels."""
+        channels = x.shape[1]
+        mean = _pixel_mean(x)
+        offset = x - mean[:, None, None]
+        edged = F.pad(offset, (1, 1, 1, 1), mode="replicate")
+        blurred = F.conv2d(edged, blur.expand(channels, 1, 3, 3), groups=channels)
+        ctx.save_for_backward(blurred)
+        return mean, _pixel_mean(offset * blurred)
+
+    @staticmethod
+    def backward(ctx: Any, grad_mean: Tensor, grad_variance: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        """Return the gradient of x."""
+        (blurred,) = ctx.saved_tensors
+        pixels = blurred.numel() // blurred.shape[1]
+        slope = (2 * grad_variance / pixels)[:, None, None]
+        return torch.addcmul((grad_mean / pixels)[:, None, None], blurred, slope), None
 
 
 def _image_from_phases(y: Tensor, height: int, width: int) -> Tensor:

@@ -193,4 +193,4 @@ def _notes_on_method(buffers: RenderBuffers, settings: FitSettings) -> list[str]
 
 def _nchw(image: Tensor) -> Tensor:
     """(height, width, channels) as a batch of one, channels last in memory."""
-    return image.contiguous().permute(2, 0, 1)[None]
+    return image.contiguous()[None].permute(0, 3, 1, 2)

@@ -1,0 +1,123 @@
+"""The networks: counts against the published code, values against plain layers, any size, gradients."""
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+import torch.nn.functional as F  # noqa: E402, N812
+
+from tungsten_dip.fit import networks  # noqa: E402
+from tungsten_dip.fit.networks import ResNet, Skip, mirror_to_multiple  # noqa: E402
+
+TINY = (4, 6)
+
+
+@pytest.fixture(autouse=True)
+def _own_random_numbers():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(7)
+        yield
+
+
+def parameters(network):
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+def channels_last(*shape, dtype=torch.float64):
+    return torch.randn(*shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
+
+
+def randomised(module):
+    """In float64, with norms that do not start out as identities."""
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter)
+    return module.double()
+
+
+@pytest.mark.parametrize(
+    ("in_channels", "channels", "count"),
+    [
+        (3, (8, 16, 32, 64, 128), 572_827),
+        (42, (8, 16, 32, 64, 128), 575_635),
+        (3, (16, 32, 64, 128, 256), 2_268_683),
+        (42, (16, 32, 64, 128, 256), 2_274_299),
+    ],
+)
+def test_skip_has_as_many_parameters_as_published(in_channels, channels, count):
+    assert parameters(Skip(in_channels, channels=channels)) == count
+
+
+def test_resnet_has_as_many_parameters_as_published():
+    assert parameters(ResNet(3)) == 196_675
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 70), (5, 3), (64, 64), (33, 65)])
+@pytest.mark.parametrize("network", [Skip, ResNet])
+def test_output_has_the_size_of_the_input(network, height, width):
+    output = network(4, 5)(torch.rand(1, 4, height, width))
+    assert output.shape == (1, 5, height, width)
+    assert torch.isfinite(output).all()
+
+
+@pytest.mark.parametrize("channels", [(3,), (3, 4), (3, 4, 5, 6)])
+def test_skip_takes_any_number_of_scales(channels):
+    assert Skip(2, 1, channels)(torch.rand(1, 2, 9, 20)).shape == (1, 1, 9, 20)
+
+
+def test_mirroring_continues_as_a_mirror_does():
+    row = torch.arange(3.0)[None, None, None]
+    assert mirror_to_multiple(row, 8, at_least=1)[0, 0, 0].tolist() == [0, 1, 2, 1, 0, 1, 2, 1]
+    assert mirror_to_multiple(row, 3, at_least=1).shape == (1, 1, 3, 3)
+
+
+def test_up_equals_upsampling_and_convolving_layer_by_layer():
+    up = randomised(networks._Up(5, 7))
+    coarse = channels_last(2, 5, 6, 9) + 3
+    plain = up.blend(up.conv(up.norm(F.interpolate(coarse, scale_factor=2, mode="bilinear"))))
+    torch.testing.assert_close(up(coarse, None), plain)
+
+
+@pytest.mark.parametrize("channels", [3, 20])
+def test_norm_act_equals_torch_in_any_memory_order(channels):
+    layer = randomised(networks._NormAct(channels))
+    x = channels_last(2, channels, 5, 4)
+    plain = F.batch_norm(x, None, None, layer.weight, layer.bias, training=True, eps=layer.eps)
+    plain = F.leaky_relu(plain, networks.LEAKY_SLOPE)
+    torch.testing.assert_close(layer(x.clone().requires_grad_()), plain)
+    torch.testing.assert_close(layer(x.contiguous().requires_grad_()), plain)
+    torch.testing.assert_close(layer(x), plain)
+
+
+@pytest.mark.parametrize("network", [Skip(2, 1, TINY), ResNet(2, 1, blocks=1, width=3)])
+def test_gradients_are_those_of_the_values(network):
+    network = network.double().to(memory_format=torch.channels_last)
+    image = channels_last(1, 2, 7, 10)
+    weights = list(network.parameters())
+
+    def loss(*_):
+        return network(image).square().sum()
+
+    assert torch.autograd.gradcheck(loss, weights, fast_mode=True)
+
+
+def test_gradient_reaches_the_input_through_the_upsampling():
+    up = randomised(networks._Up(2, 3)).to(memory_format=torch.channels_last)
+    assert torch.autograd.gradcheck(lambda x: up(x, None), channels_last(1, 2, 3, 4).requires_grad_())
+
+
+def test_memory_order_does_not_change_the_values():
+    network = Skip(3, 3, TINY).double()
+    image = torch.rand(1, 3, 12, 20, dtype=torch.float64)
+    expected = network(image)
+    network.to(memory_format=torch.channels_last)
+    torch.testing.assert_close(network(image.contiguous(memory_format=torch.channels_last)), expected)
+
+
+def test_eval_changes_nothing_and_final_replaces_the_sigmoid():
+    network = Skip(3, 3, TINY, final=torch.exp)
+    image = torch.rand(1, 3, 16, 16)
+    with torch.no_grad():
+        trained = network(image)
+        torch.testing.assert_close(network.eval()(image), trained)
+        network.final = torch.sigmoid
+        torch.testing.assert_close(torch.logit(network(image)), trained.log(), rtol=1e-4, atol=1e-5)
