@@ -420,25 +420,27 @@ class TungstenPath final : public Variant::Integrator {
                 const bool goes_on =
                     next.kind == Scattering::forward ||
                     (next.kind != Scattering::none && consistent(hit, direction, next.local_direction));
+                // A BSDF that lets a share of the rays through says so in `eval`: its light is gathered
+                // whether or not this ray goes on, and not only where it does not.
+                const bool gathers_light = light_sampling_ && (medium_bounces > 0 || include_surfaces_) &&
+                                           has_flag(bsdf.flags(), BSDFFlags::Smooth);
                 std::optional<float> light_visibility;
+                if (gathers_light && bounce < max_bounces_ - 1)
+                    result += throughput *
+                              light_from(
+                                  scene, hit, bounce + 1, random,
+                                  [&](const Vector3& towards) {
+                                      const Vector3 local = hit.to_local(towards);
+                                      if (!consistent(hit, towards, local)) return LightTransport{};
+                                      return LightTransport{
+                                          bsdf.eval_pdf(BSDFContext(), hit, local),
+                                          hit.is_medium_transition() ? hit.target_medium(towards) : medium};
+                                  },
+                                  &light_visibility);
                 if (next.kind != Scattering::forward) {
                     if (emitter != nullptr && bounce >= min_bounces_)
                         result += throughput * emitted(hit, *emitter);
-                    samples_lights = light_sampling_ && (medium_bounces > 0 || include_surfaces_) &&
-                                     has_flag(bsdf.flags(), BSDFFlags::Smooth);
-                    if (samples_lights && bounce < max_bounces_ - 1)
-                        result +=
-                            throughput *
-                            light_from(
-                                scene, hit, bounce + 1, random,
-                                [&](const Vector3& towards) {
-                                    const Vector3 local = hit.to_local(towards);
-                                    if (!consistent(hit, towards, local)) return LightTransport{};
-                                    return LightTransport{
-                                        bsdf.eval_pdf(BSDFContext(), hit, local),
-                                        hit.is_medium_transition() ? hit.target_medium(towards) : medium};
-                                },
-                                &light_visibility);
+                    samples_lights = gathers_light;
                     if (goes_on) {
                         was_specular = next.kind == Scattering::specular;
                         vertex = hit;
@@ -518,6 +520,11 @@ class TungstenPath final : public Variant::Integrator {
     static bool scatters(const Medium& medium, Ray3 ray, float surface_t, Random& random, Rgb& throughput,
                          MediumHit& hit) {
         if (medium.is_homogeneous()) {
+            const auto [sigma_s, sigma_n, sigma_t] = medium.get_scattering_coefficients(hit);
+            if (is_black(sigma_s)) {
+                throughput *= std::isfinite(surface_t) ? Rgb(dr::exp(-surface_t * sigma_t)) : Rgb(0.f);
+                return false;
+            }
             // The channel that picks the distance is random; the balance heuristic over all three keeps
             // colour noise low.
             const auto channel = static_cast<uint32_t>(3.f * random.next());
