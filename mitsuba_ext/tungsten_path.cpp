@@ -347,7 +347,8 @@ class TungstenPath final : public Variant::Integrator {
                               (static_cast<float>(position.y()) + pixel_center_ + offset.y()) /
                                   static_cast<float>(size.y()));
             const Point2 lens = sensor.needs_aperture_sample() ? random.next_2d() : Point2(0.5f);
-            const auto [ray, weight] = sensor.sample_ray(0.f, 0.f, film, lens);
+            auto [ray, weight] = sensor.sample_ray(0.f, 0.f, film, lens);
+            undo_clipping(sensor, ray);
             Sample sample;
             sample.set(color, weight * radiance(scene, sensor.medium(), ray, random, sample));
             for (const Quantity quantity : quantities_)
@@ -357,6 +358,15 @@ class TungstenPath final : public Variant::Integrator {
             accumulators[quantity].store(channel_count(quantity), out);
             out += 3 * channel_count(quantity) + 1;
         }
+    }
+
+    // Tungsten's rays begin at the lens and have no end; Mitsuba's lie between two planes.
+    static void undo_clipping(const Sensor& sensor, Ray3& ray) {
+        const auto* camera = dynamic_cast<const Variant::ProjectiveCamera*>(&sensor);
+        if (camera == nullptr) return;
+        const Vector3 forward = camera->world_transform() * Vector3(0.f, 0.f, 1.f);
+        ray.o -= ray.d * (camera->near_clip() / dr::dot(ray.d, forward));
+        ray.maxt = dr::Largest<float>;
     }
 
     // Follows one path. Features are recorded at the first surface where the path does not go on specularly

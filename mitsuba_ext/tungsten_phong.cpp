@@ -19,8 +19,8 @@ class Phong final : public TungstenBsdf<Float, Spectrum> {
         m_albedo = props.get_texture<Texture>("albedo", 1.f);
         m_exponent = props.get<float>("exponent", 64.f);
         m_diffuse_ratio = props.get<float>("diffuse_ratio", 0.2f);
-        Base::add_component(BSDFFlags::GlossyReflection);
-        Base::add_component(BSDFFlags::DiffuseReflection);
+        Base::add_component(BSDFFlags::GlossyReflection | BSDFFlags::FrontSide);
+        Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
@@ -38,10 +38,6 @@ class Phong final : public TungstenBsdf<Float, Spectrum> {
         const Vector3f wo =
             lobe.to_world(Vector3f(std::cos(phi) * sin_theta, std::sin(phi) * sin_theta, cos_theta));
         return Base::weighted(Base::sample_of(wo, BSDFFlags::GlossyReflection, 0), si);
-    }
-
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
     }
 
     MI_DECLARE_CLASS(Phong)

@@ -16,7 +16,7 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
     explicit OrenNayar(const Properties& props) : Base(props) {
         m_albedo = props.get_texture<Texture>("albedo", 1.f);
         m_roughness = props.get_texture<Texture>("roughness", 1.f);
-        Base::add_component(BSDFFlags::DiffuseReflection);
+        Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
@@ -26,10 +26,6 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
         const Vector3f wo = sample1 < uniform_share(si) ? warp::square_to_uniform_hemisphere(sample2)
                                                         : warp::square_to_cosine_hemisphere(sample2);
         return Base::weighted(Base::sample_of(wo, BSDFFlags::DiffuseReflection, 0), si);
-    }
-
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
     }
 
     MI_DECLARE_CLASS(OrenNayar)

@@ -15,8 +15,8 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
     explicit DiffuseTransmission(const Properties& props) : Base(props) {
         m_albedo = props.get_texture<Texture>("albedo", 1.f);
         m_transmittance = props.get<float>("transmittance", 0.5f);
-        Base::add_component(BSDFFlags::DiffuseReflection, BSDFFlags::FrontSide | BSDFFlags::BackSide);
-        Base::add_component(BSDFFlags::DiffuseTransmission, BSDFFlags::FrontSide | BSDFFlags::BackSide);
+        Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide | BSDFFlags::BackSide);
+        Base::add_component(BSDFFlags::DiffuseTransmission | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
@@ -26,14 +26,12 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
         const bool transmit = sample1 < m_transmittance;
         Vector3f wo = warp::square_to_cosine_hemisphere(sample2);
         if (transmit == (si.wi.z() > 0.f)) wo.z() = -wo.z();
-        return Base::weighted(
-            transmit ? Base::sample_of(wo, BSDFFlags::DiffuseTransmission, 1)
-                     : Base::sample_of(wo, BSDFFlags::DiffuseReflection, 0),
-            si);
-    }
-
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
+        BSDFSample3f bs = transmit ? Base::sample_of(wo, BSDFFlags::DiffuseTransmission, 1)
+                                   : Base::sample_of(wo, BSDFFlags::DiffuseReflection, 0);
+        // Tungsten forgets here that only a share of the directions goes to this side; as it weighs its light
+        // samples by the right density, its picture is somewhat too bright.
+        bs.pdf = kInvPi * std::abs(wo.z());
+        return {bs, m_albedo->eval(si)};
     }
 
     MI_DECLARE_CLASS(DiffuseTransmission)

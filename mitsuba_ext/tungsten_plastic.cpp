@@ -28,8 +28,9 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
                 RoughReflection::distribution_from_name(props.get<std::string>("distribution", "ggx"));
             m_base_weight *= m_albedo->mean();
         }
-        Base::add_component(m_roughness ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection);
-        Base::add_component(BSDFFlags::DiffuseReflection);
+        Base::add_component((m_roughness ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection) |
+                            BSDFFlags::FrontSide);
+        Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
@@ -46,14 +47,9 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
         if (m_roughness)
             return Base::weighted(
                 Base::sample_of(layer(si).sample(wi, sample2), BSDFFlags::GlossyReflection, 0), si);
-        BSDFSample3f bs =
-            Base::sample_of(Vector3f(-wi.x(), -wi.y(), wi.z()), BSDFFlags::DeltaReflection, 0);
+        BSDFSample3f bs = Base::sample_of(Vector3f(-wi.x(), -wi.y(), wi.z()), BSDFFlags::DeltaReflection, 0);
         bs.pdf = probability;
         return {bs, Spectrum(reflectance / probability)};
-    }
-
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
     }
 
     MI_DECLARE_CLASS(Plastic)

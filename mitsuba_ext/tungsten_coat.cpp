@@ -1,7 +1,6 @@
 // tungsten_coat: another BSDF under a dielectric layer, smooth or rough, that bends light and may absorb.
 //
 //   (nested)       the BSDF below, which must not transmit
-//   albedo         texture: has no part in the reflection, is only what the albedo buffer shows
 //   ior            float: index of refraction of the layer
 //   sigma_a        rgb: absorption in the layer times its thickness
 //   roughness      texture: of the layer; absent where it is smooth
@@ -20,7 +19,6 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
         for (auto& prop : props.objects())
             if (auto* bsdf = prop.try_get<BSDF>()) m_substrate = bsdf;
         if (!m_substrate) Throw("Expected a nested BSDF under the coat");
-        m_albedo = props.get_texture<Texture>("albedo", 1.f);
         m_ior = props.get<float>("ior", 1.3f);
         m_sigma_a = props.get<Color3f>("sigma_a", Color3f(0.f));
         m_absorbs = dr::max(m_sigma_a) > 0.f;
@@ -30,9 +28,10 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
             m_distribution =
                 RoughReflection::distribution_from_name(props.get<std::string>("distribution", "ggx"));
         }
-        Base::add_component(m_roughness ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection);
+        Base::add_component((m_roughness ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection) |
+                            BSDFFlags::FrontSide);
         for (size_t i = 0; i < m_substrate->component_count(); ++i)
-            Base::add_component(static_cast<BSDFFlags>(m_substrate->flags(i)));
+            Base::add_component(m_substrate->flags(i));
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si,
@@ -83,10 +82,6 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
         return {bs, density > 0.f ? value / density : Spectrum(0.f)};
     }
 
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
-    }
-
     MI_DECLARE_CLASS(Coat)
 
   protected:
@@ -131,7 +126,6 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
     }
 
     ref<BSDF> m_substrate;
-    ref<Texture> m_albedo;
     ref<Texture> m_roughness;
     RoughReflection::Distribution m_distribution = RoughReflection::Distribution::Ggx;
     float m_ior;

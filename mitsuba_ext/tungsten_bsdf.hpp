@@ -87,7 +87,8 @@ struct RoughReflection {
                 return kInvPi * std::exp(-tan_squared / squared(alpha)) / squared(alpha * cos_squared);
             case Distribution::Phong:
                 return (alpha + 2.f) / kTwoPi * float(std::pow(double(cos_m), double(alpha)));
-            default: return kInvPi * squared(alpha / (cos_squared * (squared(alpha) + tan_squared)));
+            default:
+                return kInvPi * squared(alpha / (cos_squared * (squared(alpha) + tan_squared)));
         }
     }
 
@@ -95,8 +96,7 @@ struct RoughReflection {
         if (cos_v <= 0.f) return 0.f;
         const float tangent = std::sqrt(std::max(1.f - cos_v * cos_v, 0.f)) / cos_v;
         if (tangent == 0.f) return 1.f;
-        if (distribution == Distribution::Ggx)
-            return 2.f / (1.f + std::sqrt(1.f + squared(alpha * tangent)));
+        if (distribution == Distribution::Ggx) return 2.f / (1.f + std::sqrt(1.f + squared(alpha * tangent)));
         const float a = distribution == Distribution::Phong ? std::sqrt(0.5f * alpha + 1.f) / tangent
                                                             : 1.f / (alpha * tangent);
         if (a >= 1.6f) return 1.f;
@@ -129,7 +129,8 @@ struct RoughReflection {
             case Distribution::Phong:
                 cos_m = float(std::pow(double(u.x()), 1.0 / (double(a) + 2.0)));
                 break;
-            default: cos_m = 1.f / std::sqrt(1.f + squared(a) * u.x() / (1.f - u.x()));
+            default:
+                cos_m = 1.f / std::sqrt(1.f + squared(a) * u.x() / (1.f - u.x()));
         }
         const float sin_m = std::sqrt(std::max(1.f - cos_m * cos_m, 0.f));
         const Vector3f m(std::cos(kTwoPi * u.y()) * sin_m, std::sin(kTwoPi * u.y()) * sin_m, cos_m);
@@ -166,9 +167,9 @@ class TungstenBsdf : public BSDF<Float, Spectrum> {
   protected:
     virtual std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const = 0;
 
-    void add_component(BSDFFlags lobe, BSDFFlags sides = BSDFFlags::FrontSide) {
-        m_components.push_back(lobe | sides);
-        m_flags = m_flags | m_components.back();
+    void add_component(uint32_t lobe_and_sides) {
+        m_components.push_back(lobe_and_sides);
+        m_flags = m_flags | lobe_and_sides;
     }
 
     // A sample of a lobe; its density is filled in by the caller.
@@ -193,11 +194,11 @@ class TungstenBsdf : public BSDF<Float, Spectrum> {
 }  // namespace mitsuba
 
 // Registers a plugin for the one variant that the embedded host renders with.
-#define TUNGSTEN_EXPORT_PLUGIN(Name)                                                            \
+#define TUNGSTEN_EXPORT_PLUGIN(Name)                                                              \
     extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn add) { \
-        using Plugin = mitsuba::Name<float, mitsuba::Color<float, 3>>;                          \
-        add(name, "scalar_rgb", Plugin::Type,                                                   \
-            [](void*, const mitsuba::Properties& props) -> mitsuba::ref<mitsuba::Object> {      \
-                return new Plugin(props);                                                       \
-            });                                                                                 \
+        using Plugin = mitsuba::Name<float, mitsuba::Color<float, 3>>;                            \
+        add(name, "scalar_rgb", Plugin::Type,                                                     \
+            [](void*, const mitsuba::Properties& props) -> mitsuba::ref<mitsuba::Object> {        \
+                return new Plugin(props);                                                         \
+            });                                                                                   \
     }

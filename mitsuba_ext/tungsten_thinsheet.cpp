@@ -1,7 +1,6 @@
 // tungsten_thinsheet: a film that reflects like a mirror and lets the rest through unbent. Reflections within
 // the film are summed, per polarisation, or interfere by its thickness and the wavelength.
 //
-//   albedo         texture: has no part in the reflection, is only what the albedo buffer shows
 //   ior            float
 //   interference   boolean; thickness is then in units of 500 nm
 //   thickness      texture
@@ -17,13 +16,12 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture)
 
     explicit ThinSheet(const Properties& props) : Base(props) {
-        m_albedo = props.get_texture<Texture>("albedo", 1.f);
         m_ior = props.get<float>("ior", 1.5f);
         m_interference = props.get<bool>("interference", false);
         m_thickness = props.get_texture<Texture>("thickness", 0.5f);
         m_sigma_a = props.get<Color3f>("sigma_a", Color3f(0.f));
-        Base::add_component(BSDFFlags::DeltaReflection, BSDFFlags::FrontSide | BSDFFlags::BackSide);
-        Base::add_component(BSDFFlags::Null, BSDFFlags::FrontSide | BSDFFlags::BackSide);
+        Base::add_component(BSDFFlags::DeltaReflection | BSDFFlags::FrontSide | BSDFFlags::BackSide);
+        Base::add_component(BSDFFlags::Null | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
@@ -44,10 +42,6 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
 
     Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask) const override {
         return split(si).second;
-    }
-
-    Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_albedo->eval(si, active);
     }
 
     MI_DECLARE_CLASS(ThinSheet)
@@ -93,7 +87,6 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
         return 1.f - 0.5f * (through(t_s, r_s) + through(t_p, r_p));
     }
 
-    ref<Texture> m_albedo;
     ref<Texture> m_thickness;
     Color3f m_sigma_a;
     float m_ior;

@@ -1,0 +1,47 @@
+// tungsten_emission: a texture for area lights that is sampled by area, as Tungsten does.
+//
+// Mitsuba samples the texels of a light's texture instead, which needs UV that cover the shape once.
+//
+//   (nested)   the texture of the radiance
+#include <mitsuba/core/properties.h>
+#include <mitsuba/render/texture.h>
+
+#include <string>
+
+#include "tungsten_bsdf.hpp"
+
+namespace mitsuba {
+
+template <typename Float, typename Spectrum>
+class Emission final : public Texture<Float, Spectrum> {
+  public:
+    using Base = Texture<Float, Spectrum>;
+    MI_IMPORT_TYPES(Texture)
+
+    explicit Emission(const Properties& props) : Base(props) {
+        for (auto& prop : props.objects())
+            if (auto* texture = prop.try_get<Texture>()) m_texture = texture;
+        if (!m_texture) Throw("Expected a nested texture");
+    }
+
+    UnpolarizedSpectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
+        return m_texture->eval(si, active);
+    }
+
+    Float mean() const override { return m_texture->mean(); }
+
+    ScalarFloat max() const override { return m_texture->max(); }
+
+    bool is_spatially_varying() const override { return false; }
+
+    std::string to_string() const override { return "Emission[]"; }
+
+    MI_DECLARE_CLASS(Emission)
+
+  private:
+    ref<Texture> m_texture;
+};
+
+}  // namespace mitsuba
+
+TUNGSTEN_EXPORT_PLUGIN(Emission)

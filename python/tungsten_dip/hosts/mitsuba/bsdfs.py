@@ -1,0 +1,255 @@
+"""Tungsten's BSDFs as Mitsuba's, or as our plugins where Mitsuba has no counterpart.
+
+Tungsten turns a BSDF that does not transmit towards the viewer, which Mitsuba's "twosided" does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, texture_node
+from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant
+from tungsten_dip.scene import types as ts
+
+_WHITE = (1.0, 1.0, 1.0)
+_SMALLEST_ALPHA = 1e-3  # Tungsten clamps roughness here
+
+
+def bsdf_object(t: Translation, bsdf: ts.Bsdf, uv: Matrix = UV) -> Any:
+    """Return the Mitsuba BSDF for a surface with this parameterisation, and note its albedo texture.
+
+    Raises InputError for what has no counterpart.
+    """
+    key = ("bsdf", bsdf, uv.tobytes().hex())
+    found = t.made(key)
+    if found is not None:
+        return found
+    outer, t.place = t.place, f"{t.place}, {_named(bsdf)}" if t.place else _named(bsdf)
+    if bsdf.bump is not None and not is_constant(bsdf.bump):
+        raise t.unsupported("bump mapping")
+    built = t.add_object("bsdf", _node(t, bsdf, uv))
+    t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
+    t.place = outer
+    return t.remember(key, built)
+
+
+def _named(bsdf: ts.Bsdf) -> str:
+    return f'bsdf "{bsdf.name}"' if bsdf.name else f"bsdf of type {bsdf.kind}"
+
+
+def _feature_albedo(bsdf: ts.Bsdf) -> ts.Texture:
+    """What Tungsten writes into the albedo buffer: the BSDF's own albedo, whatever it does with it."""
+    return bsdf.base.albedo if isinstance(bsdf, ts.TransparencyBsdf) else bsdf.albedo
+
+
+def _transmits(bsdf: ts.Bsdf) -> bool:
+    """Whether Tungsten counts it as transmissive, and does not turn it towards the viewer."""
+    match bsdf:
+        case ts.RoughDielectricBsdf():
+            return bsdf.enable_refraction
+        case ts.SmoothCoatBsdf() | ts.RoughCoatBsdf():
+            return _transmits(bsdf.substrate)
+        case ts.TransparencyBsdf():
+            return _transmits(bsdf.base)
+        case ts.MixedBsdf():
+            return _transmits(bsdf.bsdf0) or _transmits(bsdf.bsdf1)
+        case ts.DielectricBsdf() | ts.DiffuseTransmissionBsdf() | ts.HairBsdf() | ts.LambertianFiberBsdf():
+            return True
+    return False
+
+
+def _is_specular(bsdf: ts.Bsdf) -> bool:
+    """Whether some of its light is scattered into single directions, or goes straight on."""
+    match bsdf:
+        case ts.MixedBsdf():
+            return _is_specular(bsdf.bsdf0) or _is_specular(bsdf.bsdf1)
+        case ts.RoughCoatBsdf():
+            return _is_specular(bsdf.substrate)
+    return not isinstance(
+        bsdf,
+        ts.LambertBsdf
+        | ts.OrenNayarBsdf
+        | ts.PhongBsdf
+        | ts.RoughConductorBsdf
+        | ts.RoughDielectricBsdf
+        | ts.RoughPlasticBsdf
+        | ts.DiffuseTransmissionBsdf,
+    )
+
+
+def _node(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+    if isinstance(bsdf, ts.TransparencyBsdf):
+        # The mask comes outside: what is behind "twosided" must not transmit.
+        opacity = texture_node(t, bsdf.alpha, "alpha_or_average", uv)
+        return {"type": "mask", "opacity": opacity, "nested": _node(t, bsdf.base, uv)}
+    one_sided = _one_sided(t, bsdf, uv)
+    has_both_sides = _transmits(bsdf) or isinstance(bsdf, ts.ThinSheetBsdf | ts.ForwardBsdf)
+    # A mirror reflects on both sides of its own accord.
+    turned = t.source.integrator.enable_two_sided_shading or isinstance(bsdf, ts.MirrorBsdf)
+    return one_sided if has_both_sides or not turned else {"type": "twosided", "nested": one_sided}
+
+
+def _one_sided(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+    translate = _TRANSLATORS.get(type(bsdf))
+    if translate is None:
+        raise t.unsupported(f"a BSDF of type {bsdf.kind}")
+    return translate(t, bsdf, uv)
+
+
+def _albedo(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+    return texture_node(t, bsdf.albedo, "rgb", uv)
+
+
+def _lambert(t: Translation, bsdf: ts.LambertBsdf, uv: Matrix) -> Node:
+    return {"type": "diffuse", "reflectance": _albedo(t, bsdf, uv)}
+
+
+def _oren_nayar(t: Translation, bsdf: ts.OrenNayarBsdf, uv: Matrix) -> Node:
+    roughness = texture_node(t, bsdf.roughness, "average", uv)
+    return {"type": "tungsten_oren_nayar", "albedo": _albedo(t, bsdf, uv), "roughness": roughness}
+
+
+def _phong(t: Translation, bsdf: ts.PhongBsdf, uv: Matrix) -> Node:
+    return {
+        "type": "tungsten_phong",
+        "albedo": _albedo(t, bsdf, uv),
+        "exponent": bsdf.exponent,
+        "diffuse_ratio": bsdf.diffuse_ratio,
+    }
+
+
+def _mirror(t: Translation, bsdf: ts.MirrorBsdf, uv: Matrix) -> Node:
+    return {"type": "conductor", "material": "none", "specular_reflectance": _albedo(t, bsdf, uv)}
+
+
+def _conductor(t: Translation, bsdf: ts.ConductorBsdf | ts.RoughConductorBsdf, uv: Matrix) -> Node:
+    node = {
+        "type": "conductor",
+        "eta": constant(bsdf.eta),
+        "k": constant(bsdf.k),
+        "specular_reflectance": _albedo(t, bsdf, uv),
+    }
+    if isinstance(bsdf, ts.RoughConductorBsdf):
+        node |= {"type": "roughconductor", **_microfacets(t, bsdf, uv)}
+    return node
+
+
+def _dielectric(t: Translation, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
+    return {"type": "dielectric", **_refraction(t, bsdf, uv)}
+
+
+def _rough_dielectric(t: Translation, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+    if bsdf.enable_refraction:
+        return {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
+    if not is_constant(bsdf.albedo, _WHITE):
+        raise t.unsupported("a coloured rough_dielectric without refraction")
+    # Rough plastic with a black base is the reflection alone.
+    return {"type": "tungsten_plastic", "albedo": constant(0.0), "ior": bsdf.ior, **_rough_layer(t, bsdf, uv)}
+
+
+def _refraction(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+    return {
+        "int_ior": bsdf.ior,
+        "ext_ior": 1.0,
+        "specular_reflectance": _albedo(t, bsdf, uv),
+        "specular_transmittance": _albedo(t, bsdf, uv) if bsdf.enable_refraction else constant(0.0),
+    }
+
+
+def _microfacets(t: Translation, bsdf: ts.RoughConductorBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+    if bsdf.distribution == "phong":
+        raise t.unsupported(f"a {bsdf.kind} of distribution phong")
+    alpha: Node | float = texture_node(t, bsdf.roughness, "average", uv)
+    if isinstance(bsdf.roughness, ts.ConstantTexture):
+        alpha = max(bsdf.roughness.value[0], _SMALLEST_ALPHA)
+    return {"distribution": bsdf.distribution, "alpha": alpha}
+
+
+def _rough_layer(
+    t: Translation, bsdf: ts.RoughPlasticBsdf | ts.RoughCoatBsdf | ts.RoughDielectricBsdf, uv: Matrix
+) -> Node:
+    roughness = texture_node(t, bsdf.roughness, "average", uv)
+    return {"roughness": roughness, "distribution": bsdf.distribution}
+
+
+def _layer(
+    bsdf: ts.PlasticBsdf | ts.RoughPlasticBsdf | ts.SmoothCoatBsdf | ts.RoughCoatBsdf,
+) -> Node:
+    return {
+        "ior": bsdf.ior,
+        "sigma_a": {"type": "rgb", "value": [bsdf.thickness * s for s in bsdf.sigma_a]},
+    }
+
+
+def _plastic(t: Translation, bsdf: ts.PlasticBsdf | ts.RoughPlasticBsdf, uv: Matrix) -> Node:
+    node = {"type": "tungsten_plastic", "albedo": _albedo(t, bsdf, uv), **_layer(bsdf)}
+    return node | _rough_layer(t, bsdf, uv) if isinstance(bsdf, ts.RoughPlasticBsdf) else node
+
+
+def _coat(t: Translation, bsdf: ts.SmoothCoatBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
+    substrate = bsdf.substrate
+    if _transmits(substrate) or isinstance(
+        substrate, ts.TransparencyBsdf | ts.ThinSheetBsdf | ts.ForwardBsdf
+    ):
+        raise t.unsupported(f"a {bsdf.kind} over a BSDF that transmits ({substrate.kind})")
+    node = {"type": "tungsten_coat", "nested": _one_sided(t, substrate, uv), **_layer(bsdf)}
+    return node | _rough_layer(t, bsdf, uv) if isinstance(bsdf, ts.RoughCoatBsdf) else node
+
+
+def _thinsheet(t: Translation, bsdf: ts.ThinSheetBsdf, uv: Matrix) -> Node:
+    return {
+        "type": "tungsten_thinsheet",
+        "ior": bsdf.ior,
+        "interference": bsdf.enable_interference,
+        "thickness": texture_node(t, bsdf.thickness, "average", uv),
+        "sigma_a": {"type": "rgb", "value": list(bsdf.sigma_a)},
+    }
+
+
+def _diffuse_transmission(t: Translation, bsdf: ts.DiffuseTransmissionBsdf, uv: Matrix) -> Node:
+    return {"type": "tungsten_diffuse_transmission", "albedo": _albedo(t, bsdf, uv), "transmittance": 0.5}
+
+
+def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
+    for part in (bsdf.bsdf0, bsdf.bsdf1):
+        if _is_specular(part):
+            # Tungsten weights these against each other as if a single direction had a density.
+            raise t.unsupported(f"a mixed BSDF with a specular part ({part.kind})")
+    if not is_constant(bsdf.albedo, _WHITE):
+        raise t.unsupported("a mixed BSDF with an albedo of its own")
+    return {
+        "type": "blendbsdf",
+        "weight": texture_node(t, bsdf.ratio, "average", uv),
+        "bsdf_0": _one_sided(t, bsdf.bsdf1, uv),
+        "bsdf_1": _one_sided(t, bsdf.bsdf0, uv),
+    }
+
+
+def _null(t: Translation, bsdf: ts.NullBsdf, uv: Matrix) -> Node:
+    return {"type": "diffuse", "reflectance": constant(0.0)}
+
+
+def _forward(t: Translation, bsdf: ts.ForwardBsdf, uv: Matrix) -> Node:
+    return {"type": "null"}
+
+
+_TRANSLATORS: dict[type[ts.Bsdf], Callable[[Translation, Any, Matrix], Node]] = {
+    ts.LambertBsdf: _lambert,
+    ts.OrenNayarBsdf: _oren_nayar,
+    ts.PhongBsdf: _phong,
+    ts.MirrorBsdf: _mirror,
+    ts.ConductorBsdf: _conductor,
+    ts.RoughConductorBsdf: _conductor,
+    ts.DielectricBsdf: _dielectric,
+    ts.RoughDielectricBsdf: _rough_dielectric,
+    ts.PlasticBsdf: _plastic,
+    ts.RoughPlasticBsdf: _plastic,
+    ts.SmoothCoatBsdf: _coat,
+    ts.RoughCoatBsdf: _coat,
+    ts.ThinSheetBsdf: _thinsheet,
+    ts.DiffuseTransmissionBsdf: _diffuse_transmission,
+    ts.MixedBsdf: _mixed,
+    ts.NullBsdf: _null,
+    ts.ForwardBsdf: _forward,
+}

@@ -1,0 +1,115 @@
+"""Tungsten's lights that no ray can hit: points, and what surrounds the scene."""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, largest_value
+from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
+from tungsten_dip.scene import types as ts
+
+_CAP_ROWS = 16384  # of the map of an infinite_sphere_cap: its edge is this sharp over 180 degrees
+
+# Mitsuba's azimuth in an environment map starts at -z and Tungsten's at -x.
+_ENVMAP_AXES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+def point_node(t: Translation, primitive: ts.Point) -> Node | None:
+    """Return Mitsuba's point light, or None where it does not shine."""
+    texture = primitive.emitter
+    if texture is None or largest_value(t, texture) <= 0.0:
+        return None
+    if not isinstance(texture, ts.ConstantTexture):
+        raise t.unsupported(f"a point light with a texture of type {texture.kind}")
+    scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
+    return {
+        "type": "point",
+        "position": [float(x) for x in primitive.world_from_local[:3, 3]],
+        "intensity": constant(_scaled(texture.value, scale)),
+    }
+
+
+def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
+    """Return the Mitsuba emitter of a light that surrounds the scene, or None where it does not shine.
+
+    Raises InputError for a texture without counterpart.
+    """
+    if isinstance(primitive, ts.Skydome):
+        raise t.unsupported("a skydome")
+    texture = primitive.emitter
+    if texture is None or largest_value(t, texture) <= 0.0:
+        return None
+    if isinstance(primitive, ts.InfiniteSphereCap):
+        return _cap(t, primitive, texture)
+    scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
+    if isinstance(texture, ts.ConstantTexture):
+        return {"type": "constant", "radiance": constant(_scaled(texture.value, scale))}
+    if isinstance(texture, ts.BitmapTexture) and texture.interpolate:
+        pixels = bitmap_pixels(t, texture, "rgb") * (scale * texture.scale)
+        return envmap_node(pixels, _rotation(primitive.world_from_local), clamp=texture.clamp)
+    raise t.unsupported(f"an infinite_sphere with a texture of type {texture.kind} (or not interpolated)")
+
+
+def default_environment() -> Node:
+    """Return what Tungsten lights a scene with that has no light: white from everywhere."""
+    return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
+
+
+def envmap_node(
+    pixels: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64], *, clamp: bool = False
+) -> Node:
+    """Return an environment map of latitude-longitude texels, row 0 about local +y.
+
+    Both renderers interpolate between texels, but Mitsuba's outermost rows lie on the poles and Tungsten's
+    half a texel off. With a row for every half texel Mitsuba's map goes through all of Tungsten's.
+    """
+    above, below = (pixels[:1], pixels[-1:]) if clamp else (pixels[-1:], pixels[:1])
+    padded = np.concatenate([above, pixels, below])
+    rows = np.empty((2 * len(pixels) + 1, *pixels.shape[1:]))
+    rows[1::2] = pixels
+    rows[0::2] = 0.5 * (padded[:-1] + padded[1:])
+    return _envmap(rows, rotation)
+
+
+def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node:
+    if not isinstance(texture, ts.ConstantTexture):
+        raise t.unsupported(f"an infinite_sphere_cap with a texture of type {texture.kind}")
+    matrix = primitive.world_from_local
+    for other in t.source.primitives:
+        if primitive.skydome and other.name == primitive.skydome:
+            matrix = other.world_from_local
+    angle = math.radians(primitive.cap_angle)
+    radiance = np.asarray(texture.value, dtype=np.float64)
+    if primitive.power is not None:
+        radiance = radiance / (2.0 * math.pi * (1.0 - math.cos(angle)))
+    # The cap lies about the pole of the map, whose rows are as fine as its edge needs to be.
+    edge = angle / math.pi * (_CAP_ROWS - 1)
+    rows = np.clip(edge - np.arange(_CAP_ROWS) + 0.5, 0.0, 1.0)
+    axis = matrix[:3, 1] / np.linalg.norm(matrix[:3, 1])
+    helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.5 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(axis, helper)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, axis, np.cross(x, axis)], axis=1)
+    return _envmap(np.repeat((rows[:, None] * radiance)[:, None, :], 4, axis=1), rotation)
+
+
+def _envmap(rows: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64]) -> Node:
+    to_world = np.eye(4)
+    to_world[:3, :3] = rotation @ _ENVMAP_AXES
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(rows, dtype=np.float32)),
+        "to_world": transform(to_world),
+    }
+
+
+def _rotation(matrix: Matrix) -> npt.NDArray[np.float64]:
+    return np.asarray(matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0))
+
+
+def _scaled(value: ts.Vec3, scale: float) -> ts.Vec3:
+    return (value[0] * scale, value[1] * scale, value[2] * scale)

@@ -1,0 +1,78 @@
+"""Tungsten's cameras as Mitsuba's.
+
+Both look along +z with +y up, but Mitsuba's x axis points to the left of the picture where Tungsten's points
+to the right. Tungsten's field of view is horizontal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tungsten_dip.hosts.mitsuba.media import medium_object
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation, transform
+from tungsten_dip.scene import types as ts
+
+# The rays of Mitsuba's cameras start and end here, in scene units; Tungsten's have no such limits.
+_NEAR, _FAR = 1e-4, 1e7
+
+
+def sensor_node(t: Translation, camera: ts.Camera) -> Node:
+    """Return the Mitsuba sensor of a camera, with its film.
+
+    Raises InputError for a type of camera or a lens without counterpart.
+    """
+    t.place = f"camera of type {camera.kind}"
+    if not isinstance(camera, ts.PinholeCamera | ts.ThinlensCamera):
+        raise t.unsupported("this camera")
+    width, height = camera.resolution
+    node: Node = {
+        "fov": camera.fov,
+        "fov_axis": "x",
+        "to_world": transform(_rigid(t, camera.world_from_local) @ np.diag([-1.0, 1.0, 1.0, 1.0])),
+        "near_clip": _NEAR,
+        "far_clip": _FAR,
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        },
+    }
+    if camera.medium is not None:
+        node["medium"] = medium_object(t, camera.medium)
+    if isinstance(camera, ts.PinholeCamera) or camera.aperture_size == 0.0:
+        return {"type": "perspective", **node}
+    return {"type": "thinlens", **node, **_lens(t, camera)}
+
+
+def pixel_center(camera: ts.Camera) -> float:
+    """Return where in a pixel Tungsten centres its filter: its thin lens takes the corner."""
+    return 0.0 if isinstance(camera, ts.ThinlensCamera) else 0.5
+
+
+def _lens(t: Translation, camera: ts.ThinlensCamera) -> Node:
+    if camera.cateye > 0.0:
+        raise t.unsupported("cateye")
+    if not isinstance(camera.aperture, ts.DiskTexture):
+        raise t.unsupported(f"an aperture of type {camera.aperture.kind}")
+    return {"aperture_radius": camera.aperture_size, "focus_distance": _focus_distance(t, camera)}
+
+
+def _focus_distance(t: Translation, camera: ts.ThinlensCamera) -> float:
+    if camera.focus_pivot:
+        for primitive in t.source.primitives:
+            if primitive.name == camera.focus_pivot:
+                return float(
+                    np.linalg.norm(primitive.world_from_local[:3, 3] - camera.world_from_local[:3, 3])
+                )
+    return camera.focus_distance
+
+
+def _rigid(t: Translation, matrix: ts.Matrix) -> ts.Matrix:
+    """Return the matrix if it neither scales nor shears, cleaned of rounding."""
+    axes = matrix[:3, :3]
+    if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4):
+        raise t.unsupported("a scale in its transform")
+    return matrix

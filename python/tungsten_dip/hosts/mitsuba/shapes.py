@@ -1,0 +1,260 @@
+"""Tungsten's finite primitives as Mitsuba's shapes.
+
+Quads and cubes become meshes, since Mitsuba's have another size or parameterisation; spheres, disks and
+cylinders are turned so that their UV agree. Of a transform Tungsten keeps what its primitives need (the
+largest scale of a sphere, say), and so does this.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.hosts.mitsuba.bsdfs import bsdf_object
+from tungsten_dip.hosts.mitsuba.media import medium_object
+from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, largest_value, texture_node
+from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, transform
+from tungsten_dip.scene import types as ts
+from tungsten_dip.scene.meshes import mesh_geometry
+
+_Array = npt.NDArray[np.float64]
+
+# From Mitsuba's UV to Tungsten's.
+_DISK_UV = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_CYLINDER_UV = np.array([[-1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def add_shapes(t: Translation, primitive: ts.Primitive) -> bool:
+    """Add the shapes that stand for one primitive, and return whether it shines.
+
+    Raises InputError for what has no counterpart.
+    """
+    for shape in _shapes(t, primitive):
+        t.add("shape", shape)
+    return bool(emission_node(t, primitive, 1.0))
+
+
+def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
+    match primitive:
+        case ts.Mesh():
+            return _mesh(t, primitive)
+        case ts.Quad():
+            return [_quad(t, primitive)]
+        case ts.Cube():
+            return [_cube(t, primitive)]
+        case ts.Sphere():
+            return [_sphere(t, primitive)]
+        case ts.Disk():
+            return [_disk(t, primitive)]
+        case ts.Cylinder():
+            return _cylinder(t, primitive)
+    raise t.unsupported(f"a primitive of type {primitive.kind}")
+
+
+def emission_node(t: Translation, primitive: ts.Primitive, area: float, uv: Matrix = UV) -> Node:
+    """Return {"emitter": ...} for a primitive of this area that shines, else {}."""
+    texture = primitive.emitter
+    if texture is None or largest_value(t, texture) <= 0.0:
+        return {}
+    scale = 1.0 / (math.pi * area) if primitive.power is not None else 1.0
+    radiance = texture_node(t, texture, "rgb", uv, scale)
+    if not is_constant(texture):
+        if isinstance(primitive, ts.Sphere):
+            raise t.unsupported("a shining sphere with a texture")
+        radiance = {"type": "tungsten_emission", "radiance": radiance}
+    return {"emitter": {"type": "area", "radiance": radiance}}
+
+
+def _surroundings(t: Translation, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
+    """What a shape needs beside its geometry and its light: its BSDF and media."""
+    surface = bsdf_object(t, bsdf, uv)
+    node: Node = {surface.id(): surface}  # Mitsuba renames what it finds under another name
+    if primitive.int_medium is not None:
+        node["interior"] = medium_object(t, primitive.int_medium)
+    if primitive.ext_medium is not None:
+        node["exterior"] = medium_object(t, primitive.ext_medium)
+    return node
+
+
+def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
+    mesh = mesh_geometry(primitive)
+    matrix = primitive.world_from_local
+    positions = mesh.positions @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = mesh.normals @ np.linalg.inv(matrix[:3, :3]) if primitive.smooth else None
+    corners = positions[mesh.triangles]
+    edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = float(0.5 * np.linalg.norm(np.cross(*edges), axis=1).sum())
+    if area == 0.0:
+        return []
+    emission = emission_node(t, primitive, area)
+    materials = np.clip(mesh.materials, 0, len(primitive.bsdf) - 1)
+    return [
+        _triangles(
+            t,
+            {**_surroundings(t, primitive, bsdf), **emission},
+            positions,
+            mesh.triangles[materials == number],
+            mesh.uvs,
+            normals,
+        )
+        for number, bsdf in enumerate(primitive.bsdf)
+        if np.any(materials == number)
+    ]
+
+
+def _quad(t: Translation, primitive: ts.Quad) -> Any:
+    centre, (edge_x, _, edge_z) = primitive.world_from_local[:3, 3], primitive.world_from_local[:3, :3].T
+    lengths = np.linalg.norm(edge_x), np.linalg.norm(edge_z)
+    if abs(edge_x @ edge_z) > 1e-4 * lengths[0] * lengths[1]:
+        raise t.unsupported("a sheared quad")
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    positions = centre + (uv[:, :1] - 0.5) * edge_x + (uv[:, 1:] - 0.5) * edge_z
+    triangles = np.array([[0, 2, 1], [0, 3, 2]])
+    node = _surroundings(t, primitive, primitive.bsdf)
+    node |= emission_node(t, primitive, float(lengths[0] * lengths[1]))
+    return _triangles(t, node, positions, triangles, uv)
+
+
+def _cube(t: Translation, primitive: ts.Cube) -> Any:
+    centre, rotation, scale = _parts(primitive.world_from_local)
+    corner_uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    positions: list[_Array] = []
+    triangles: list[npt.NDArray[Any]] = []
+    uv: list[_Array] = []
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            face = np.empty((4, 3))
+            face[:, axis] = side
+            face[:, (axis + 1) % 3] = corner_uv[:, 0] - 0.5
+            face[:, (axis + 2) % 3] = corner_uv[:, 1] - 0.5
+            outward = np.array([[0, 1, 2], [0, 2, 3]])
+            triangles.append((outward if side > 0 else outward[:, ::-1]) + 4 * len(positions))
+            positions.append(face)
+            uv.append(corner_uv)
+    # A rotation that mirrors turns the faces inside out; Tungsten's normals stay outside.
+    indices = np.concatenate(triangles)
+    if np.linalg.det(rotation) < 0.0:
+        indices = indices[:, ::-1]
+    area = 2.0 * float(scale[0] * scale[1] + scale[1] * scale[2] + scale[2] * scale[0])
+    node = _surroundings(t, primitive, primitive.bsdf) | emission_node(t, primitive, area)
+    points = centre + (np.concatenate(positions) * scale) @ rotation.T
+    return _triangles(t, node, points, indices, np.concatenate(uv))
+
+
+def _sphere(t: Translation, primitive: ts.Sphere) -> Node:
+    centre, rotation, scale = _parts(primitive.world_from_local)
+    radius = float(scale.max())
+    # Half a turn about z brings Mitsuba's azimuth, which starts at +x, to Tungsten's, which starts at -x.
+    axes = radius * (rotation @ np.diag([-1.0, -1.0, 1.0]))
+    return {
+        "type": "sphere",
+        "to_world": transform(_affine(axes, centre)),
+        **_surroundings(t, primitive, primitive.bsdf),
+        **emission_node(t, primitive, 4.0 * math.pi * radius**2),
+    }
+
+
+def _disk(t: Translation, primitive: ts.Disk) -> Node:
+    centre, rotation, scale = _parts(primitive.world_from_local)
+    radius = float(max(scale[0], scale[2]))
+    emission = emission_node(t, primitive, math.pi * radius**2, _DISK_UV)
+    if emission and primitive.cone_angle != 90.0:
+        raise t.unsupported("a shining disk with a cone_angle")
+    tangent, bitangent = _tangent_frame(rotation[:, 1])
+    axes = radius * np.stack([-bitangent, -tangent, rotation[:, 1]], axis=1)
+    return {
+        "type": "disk",
+        "to_world": transform(_affine(axes, centre)),
+        **_surroundings(t, primitive, primitive.bsdf, _DISK_UV),
+        **emission,
+    }
+
+
+def _cylinder(t: Translation, primitive: ts.Cylinder) -> list[Node]:
+    centre, rotation, scale = _parts(primitive.world_from_local)
+    radius, height = 0.5 * float(max(scale[0], scale[2])), float(scale[1])
+    x, y, z = rotation.T
+    # Tungsten counts the caps whether they are there or not.
+    area = 2.0 * math.pi * radius * (radius + height)
+    emission = emission_node(t, primitive, area, _CYLINDER_UV)
+    if emission and not primitive.capped:
+        raise t.unsupported("a shining cylinder without caps")
+    side = _affine(np.stack([-radius * x, radius * z, height * y], axis=1), centre - 0.5 * height * y)
+    shapes: list[Node] = [
+        {
+            "type": "cylinder",
+            "to_world": transform(side),
+            **_surroundings(t, primitive, primitive.bsdf, _CYLINDER_UV),
+            **emission,
+        }
+    ]
+    if primitive.capped:
+        if not _is_uniform(primitive):
+            raise t.unsupported("a texture on a cylinder with caps")
+        for sign in (-1.0, 1.0):
+            axes = radius * np.stack([x, -sign * z, sign * y], axis=1)
+            shapes.append(
+                {
+                    "type": "disk",
+                    "to_world": transform(_affine(axes, centre + 0.5 * sign * height * y)),
+                    **_surroundings(t, primitive, primitive.bsdf),
+                    **emission,
+                }
+            )
+    return shapes
+
+
+def _is_uniform(primitive: ts.Cylinder) -> bool:
+    textures = [value for value in vars(primitive.bsdf).values() if isinstance(value, ts.Texture)]
+    return all(is_constant(x) for x in [*textures, *filter(None, [primitive.emitter])])
+
+
+def _triangles(
+    t: Translation,
+    node: Node,
+    positions: _Array,
+    triangles: npt.NDArray[Any],
+    uv: npt.NDArray[Any],
+    normals: _Array | None = None,
+) -> Any:
+    """Return a mesh with the vertices that its triangles use."""
+    used, indices = np.unique(triangles, return_inverse=True)
+    props = mi.Properties()
+    for name, value in node.items():
+        props[name] = mi.load_dict(value) if isinstance(value, dict) else value
+    if normals is None:
+        props["face_normals"] = True
+    mesh = mi.Mesh("mesh", len(used), len(triangles), props, normals is not None, True)
+    params = mi.traverse(mesh)
+    params["faces"] = indices.astype(np.uint32).ravel()
+    params["vertex_positions"] = positions[used].astype(np.float32).ravel()
+    if normals is not None:
+        params["vertex_normals"] = normals[used].astype(np.float32).ravel()
+    params["vertex_texcoords"] = uv[used].astype(np.float32).ravel()
+    params.update()
+    return mesh
+
+
+def _parts(matrix: Matrix) -> tuple[_Array, _Array, _Array]:
+    """Return position, unit axes (as columns) and their lengths, as Tungsten takes a matrix apart."""
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    return matrix[:3, 3], matrix[:3, :3] / scale, scale
+
+
+def _affine(axes: _Array, origin: _Array) -> Matrix:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = axes, origin
+    return matrix
+
+
+def _tangent_frame(n: _Array) -> tuple[_Array, _Array]:
+    """Return two tangents (Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017)."""
+    sign = math.copysign(1.0, n[2])
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    tangent = np.array([1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]])
+    return tangent, np.array([b, sign + n[1] * n[1] * a, -n[1]])

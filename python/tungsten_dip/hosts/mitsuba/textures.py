@@ -1,0 +1,164 @@
+"""Tungsten's textures as Mitsuba's.
+
+Tungsten's v points up in a bitmap where Mitsuba's points down, its gamma of 2.2 rounds down to 8 bits, and a
+bitmap without interpolation ignores its scale: all of that is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform_uv
+from tungsten_dip.scene.types import (
+    BitmapTexture,
+    BladeTexture,
+    CheckerTexture,
+    ConstantTexture,
+    DiskTexture,
+    Texture,
+    Vec3,
+)
+
+Request = Literal["rgb", "average", "alpha_or_average"]
+"""What is asked of a texture: its colour, the mean of it, or its alpha channel where it has one."""
+
+UV = np.eye(3)
+"""A shape whose UV are the same in both renderers; else a 3x3 matrix from Mitsuba's UV to Tungsten's."""
+
+_Texels = npt.NDArray[Any]
+
+_GAMMA = np.floor(255.0 * (np.arange(256) / 255.0) ** 2.2 + 1e-9) / 255.0
+_HDR_SUFFIXES = {".exr", ".pfm", ".hdr"}
+_SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade textures
+
+
+def texture_node(
+    t: Translation, texture: Texture, request: Request = "rgb", uv: Matrix = UV, scale: float = 1.0
+) -> Node:
+    """Return the Mitsuba texture of a Tungsten texture times ``scale``.
+
+    Numbers ("average", "alpha_or_average") have one channel, colours three.
+
+    Raises InputError for a type of texture without counterpart and for an image that cannot be read.
+    """
+    if isinstance(texture, ConstantTexture):
+        return constant(_requested(texture.value, request, scale))
+    if isinstance(texture, CheckerTexture):
+        on, off = (constant(_requested(c, request, scale)) for c in (texture.on_color, texture.off_color))
+        # Mitsuba's checkerboard swaps its two colours when it is asked for a number.
+        first, second = (off, on) if request == "rgb" else (on, off)
+        squares = np.diag([texture.res_u / 2, texture.res_v / 2, 1.0]) @ uv
+        return {
+            "type": "checkerboard",
+            "color0": first,
+            "color1": second,
+            "to_uv": transform_uv(squares),
+        }
+    if isinstance(texture, BitmapTexture):
+        pixels = bitmap_pixels(t, texture, request)
+        effective_scale = scale * texture.scale if texture.interpolate else 1.0
+        return _bitmap_node(
+            pixels * effective_scale, uv, clamp=texture.clamp, nearest=not texture.interpolate
+        )
+    if isinstance(texture, DiskTexture | BladeTexture):
+        mask = coverage(texture, _SHAPE_RESOLUTION)
+        value = np.atleast_1d(np.asarray(_requested(texture.value, request, scale)))
+        return _bitmap_node(mask[:, :, None] * value, uv, clamp=True, nearest=False)
+    raise t.unsupported(f"a texture of type {texture.kind}")
+
+
+def is_constant(texture: Texture, value: Vec3 | None = None) -> bool:
+    """Whether a texture is one colour everywhere, and that colour if one is given."""
+    return isinstance(texture, ConstantTexture) and (value is None or texture.value == value)
+
+
+def largest_value(t: Translation, texture: Texture) -> float:
+    """Return the largest component anywhere in a texture."""
+    if isinstance(texture, ConstantTexture | DiskTexture | BladeTexture):
+        return max(texture.value)
+    if isinstance(texture, CheckerTexture):
+        return max(*texture.on_color, *texture.off_color)
+    if isinstance(texture, BitmapTexture):
+        return float(bitmap_pixels(t, texture, "rgb").max()) * texture.scale
+    raise t.unsupported(f"a texture of type {texture.kind}")
+
+
+def bitmap_pixels(t: Translation, texture: BitmapTexture, request: Request) -> _Texels:
+    """Return the texels as Tungsten holds them, without scale.
+
+    Shape (height, width, 3 or 1), row 0 at the top.
+    """
+    key = ("pixels", str(texture.file), request, texture.gamma_correct)
+    texels: _Texels | None = t.made(key)
+    return t.remember(key, _read_texels(texture, request)) if texels is None else texels
+
+
+def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> _Texels:
+    """Return the share of every texel that lies within the disk or the polygon, row 0 at the top."""
+    centres = (np.arange(resolution) + 0.5) / resolution * 2.0 - 1.0
+    x, y = np.meshgrid(centres, -centres)
+    if isinstance(texture, DiskTexture):
+        inwards = 1.0 - np.hypot(x, y)
+    else:
+        # The middle of the polygon's edge that faces (x, y) lies at cos(pi / blades) from the centre.
+        half = math.pi / texture.blades
+        phi = (np.arctan2(y, x) - texture.angle) % (2 * half) - half
+        inwards = math.cos(half) - np.hypot(x, y) * np.cos(phi)
+    return np.asarray(np.clip(inwards * resolution / 2 + 0.5, 0.0, 1.0))
+
+
+def _requested(value: Vec3, request: Request, scale: float) -> Vec3 | float:
+    if request == "rgb":
+        return (value[0] * scale, value[1] * scale, value[2] * scale)
+    return value[0] * scale  # Tungsten takes the first component of a constant, not the mean
+
+
+def _bitmap_node(pixels: _Texels, uv: Matrix, *, clamp: bool, nearest: bool) -> Node:
+    height, width = pixels.shape[:2]
+    # Mitsuba wants two texels each way.
+    pixels = np.repeat(np.repeat(pixels, 2 if height < 2 else 1, axis=0), 2 if width < 2 else 1, axis=1)
+    flip_v = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, 1.0]])
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(pixels, dtype=np.float32)),
+        "raw": True,
+        "format": "variant",
+        "filter_type": "nearest" if nearest else "bilinear",
+        "wrap_mode": "clamp" if clamp else "repeat",
+        "to_uv": transform_uv(flip_v @ uv),
+    }
+
+
+def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
+    hdr = texture.file.suffix.lower() in _HDR_SUFFIXES
+    config = OpenImageIO.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    image = OpenImageIO.ImageInput.open(str(texture.file), config)
+    if image is None:
+        reason = OpenImageIO.geterror().strip()
+        raise InputError(f"{texture.file}: expected an image for a texture ({reason}); check the file")
+    pixels = image.read_image("float" if hdr else "uint8")
+    error = image.geterror()
+    image.close()
+    if pixels is None or error:
+        raise InputError(f"{texture.file}: the image is damaged ({error.strip()}); replace the file")
+    pixels = np.asarray(pixels)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    channels = pixels.shape[2]
+    alpha = pixels[:, :, -1:] if channels in (2, 4) else None
+    rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
+    if request == "rgb":
+        if hdr:
+            return rgb.astype(np.float64)
+        return _GAMMA[rgb] if texture.gamma_correct else rgb / 255.0
+    if request == "alpha_or_average" and alpha is not None:
+        return alpha.astype(np.float64) / (1.0 if hdr else 255.0)
+    total: _Texels = rgb.astype(np.float64).sum(axis=2, keepdims=True) / 3.0
+    return total if hdr else np.floor(total) / 255.0

@@ -1,0 +1,88 @@
+"""The Mitsuba scene under construction: what the translators of every kind of object share."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.scene.types import Scene
+
+Node = dict[str, Any]
+"""A dictionary for `mitsuba.load_dict`."""
+
+Matrix = npt.NDArray[np.float64]
+
+
+@dataclass
+class Translation:
+    """Collects the nodes of the scene, each under its own id, and the albedo texture of every BSDF.
+
+    Objects that Tungsten shares (a BSDF on two primitives, a medium in two) are made once, see `made`.
+    ``place`` is the part of the file that is being translated, for messages.
+    """
+
+    source: Scene
+    scene: Node = field(default_factory=lambda: {"type": "scene"})
+    albedo: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    place: str = ""
+    _made: dict[Hashable, Any] = field(default_factory=dict)
+    _keep_alive: list[Any] = field(default_factory=list)
+
+    def unsupported(self, construct: str) -> InputError:
+        """Return the error for what Mitsuba cannot show as Tungsten does."""
+        place = f"{self.place}: " if self.place else ""
+        return InputError(
+            f"{self.source.path}: {place}{construct} has no counterpart in the embedded renderer; "
+            "render with --host tungsten"
+        )
+
+    def add(self, kind: str, node: Any) -> str:
+        """Add a node (or a Mitsuba object) to the scene and return its id."""
+        name = f"{kind}_{len(self.scene)}"
+        self.scene[name] = node
+        return name
+
+    def add_object(self, kind: str, node: Node) -> Any:
+        """Build the object that a node describes, add it to the scene under its id and return it."""
+        name = f"{kind}_{len(self.scene)}"
+        built = mi.load_dict({**node, "id": name})
+        self.scene[name] = built
+        return built
+
+    def made(self, key: tuple[Any, ...]) -> Any | None:
+        """Return what was made for these objects and settings before, if it was."""
+        return self._made.get(_hashable(key))
+
+    def remember(self, key: tuple[Any, ...], result: Any) -> Any:
+        """Keep a result for `made`, and the objects of the key, so that no other takes their identity."""
+        self._keep_alive.append(key)
+        self._made[_hashable(key)] = result
+        return result
+
+
+def constant(value: tuple[float, float, float] | float) -> Node:
+    """Return a texture of one value: linear RGB or a number, of any size and sign."""
+    return {
+        "type": "rawconstant",
+        "value": [float(v) for v in value] if isinstance(value, tuple) else float(value),
+    }
+
+
+def transform(matrix: Matrix) -> Any:
+    """Return a 4x4 matrix as Mitsuba's transform."""
+    return mi.ScalarTransform4f(np.asarray(matrix, dtype=np.float64).tolist())
+
+
+def transform_uv(matrix: Matrix) -> Any:
+    """Return a 3x3 matrix as Mitsuba's transform of UV."""
+    return mi.ScalarTransform3f(np.asarray(matrix, dtype=np.float64).tolist())
+
+
+def _hashable(key: tuple[Any, ...]) -> Hashable:
+    return tuple(part if isinstance(part, str | int | float | None) else id(part) for part in key)
