@@ -70,7 +70,9 @@ $(VENV)/created:
 # Built against the packages in .venv (the plugin needs the very Mitsuba that loads it), hence without isolation.
 $(VENV)/installed: $(VENV)/created constraints.txt $(BUILD_FILES) $(CXX_SOURCES)
 	@echo "Installing what it needs and building the C++ parts: some minutes the first time"
-	$(PIP) cmake mitsuba ninja pybind11 setuptools
+	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' \
+		>$(VENV)/build-requirements.txt
+	$(PIP) --requirement $(VENV)/build-requirements.txt
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[all]'
 	@touch $@
 

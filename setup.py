@@ -15,7 +15,8 @@ class CMakeBuild(build_ext):
     def build_extension(self, ext: Extension) -> None:
         """Configure and build the top-level CMakeLists.txt."""
         root = Path(__file__).parent.resolve()
-        package_dir = Path(self.get_ext_fullpath(ext.name)).resolve().parent
+        source = root / "python" / "tungsten_dip"
+        package_dir = source if self.editable_mode else Path(self.build_lib).resolve() / "tungsten_dip"
         build_dir = root / "build" / "pip"
         subprocess.check_call(
             [
@@ -26,6 +27,9 @@ class CMakeBuild(build_ext):
         )  # fmt: skip
         jobs = os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL", str(os.cpu_count() or 1))
         subprocess.check_call(["cmake", "--build", build_dir, "--parallel", jobs])
+
+    def copy_extensions_to_source(self) -> None:
+        """Copy nothing: an editable build is placed among the sources to begin with."""
 
 
 setup(ext_modules=[Extension("tungsten_dip._core", sources=[])], cmdclass={"build_ext": CMakeBuild})
