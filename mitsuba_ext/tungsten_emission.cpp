@@ -16,11 +16,11 @@ template <typename Float, typename Spectrum>
 class Emission final : public Texture<Float, Spectrum> {
   public:
     using Base = Texture<Float, Spectrum>;
-    MI_IMPORT_TYPES(Texture)
+    MI_IMPORT_TYPES()
 
     explicit Emission(const Properties& props) : Base(props) {
         for (auto& prop : props.objects())
-            if (auto* texture = prop.try_get<Texture>()) m_texture = texture;
+            if (auto* texture = prop.try_get<Base>()) m_texture = texture;
         if (!m_texture) Throw("Expected a nested texture");
     }
 
@@ -39,7 +39,7 @@ class Emission final : public Texture<Float, Spectrum> {
     MI_DECLARE_CLASS(Emission)
 
   private:
-    ref<Texture> m_texture;
+    ref<Base> m_texture;
 };
 
 }  // namespace mitsuba
