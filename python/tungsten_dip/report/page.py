@@ -43,7 +43,7 @@ def report_page(
         denoised=_data_uri(display_from_radiance(result.color, tonemap)),
         error_map=_error_map(result),
         false_colors=", ".join(f"rgb({r} {g} {b})" for r, g, b in FALSE_COLORS),
-        curve=_curve([point for point in result.history if point.estimated_relmse]),
+        curve=_curve(result.history),
         settings="".join(f"<tr><th>{name}</th><td>{value}</td></tr>" for name, value in _settings(result)),
         notes=_bullets([*remarks, *result.notes]),
     )
@@ -98,10 +98,12 @@ def _data_uri(picture: FloatImage) -> str:
 
 def _curve(history: Sequence[HistoryPoint]) -> str:
     """Return the estimated relMSE over seconds as an SVG, its vertical axis logarithmic."""
-    if len(history) < 2:
+    # An estimate without bias may fall below zero where the error is tiny; a logarithm cannot show it.
+    known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
+    if len(known) < 2:
         return "<p>The buffers hold no independent evidence, so the error was not estimated on the way.</p>"
-    seconds = [point.seconds for point in history]
-    levels = [math.log10(point.estimated_relmse or 1) for point in history]
+    seconds = [point.seconds for point, _ in known]
+    levels = [math.log10(relmse) for _, relmse in known]
     bottom, top = math.floor(min(levels)), max(math.ceil(max(levels)), math.floor(min(levels)) + 1)
 
     def x(time_s: float) -> float:
@@ -123,8 +125,8 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
     parts.append(f'<text x="{right}" y="{CURVE_HEIGHT - 6}" text-anchor="end">seconds</text>')
     line = " ".join(f"{x(time):.1f},{y(level):.1f}" for time, level in zip(seconds, levels, strict=True))
     parts.append(f'<polyline class="curve" points="{line}"/>')
-    for point, level in zip(history, levels, strict=True):
-        told = f"{point.seconds:.1f} s, iteration {point.iteration}: relMSE {point.estimated_relmse:.3g}"
+    for (point, relmse), level in zip(known, levels, strict=True):
+        told = f"{point.seconds:.1f} s, iteration {point.iteration}: relMSE {relmse:.3g}"
         place = f'cx="{x(point.seconds):.1f}" cy="{y(level):.1f}" r="3"'
         parts.append(f"<circle {place}><title>{told}</title></circle>")
     return (
