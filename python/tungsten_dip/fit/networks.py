@@ -199,9 +199,9 @@ class _Side(nn.Sequential):
 class _Up(nn.Module):
     """Double the resolution: upsample bilinearly, join what comes in, norm, 3x3, norm, act, 1x1, norm, act.
 
-    The 3x3 convolution sees the edge repeated, where the published code mirrors it. Upsampling and
-    convolution are then together one convolution of the coarse image, with one kernel for each of the four
-    pixels that a coarse pixel becomes: the same values, without the large image in between.
+    Where nothing comes in, as at the fine scales, the 3x3 convolution sees the edge repeated in place of
+    mirrored. Upsampling and convolution are then together one convolution of the coarse image, with one
+    kernel for each of the four pixels that a coarse pixel becomes: no large image in between.
     """
 
     phase_kernels: Tensor
@@ -210,7 +210,7 @@ class _Up(nn.Module):
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         self.norm = _Norm(in_channels)
-        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, padding_mode="replicate")
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, padding_mode="reflect")
         self.blend = nn.Sequential(
             _NormAct(out_channels), nn.Conv2d(out_channels, out_channels, 1), _NormAct(out_channels)
         )
@@ -227,7 +227,10 @@ class _Up(nn.Module):
         return then(y) if then else y
 
     def _phases(self, coarse: Tensor) -> Tensor:
-        """Equal ``conv(norm(upsample(coarse)))``, in the order of pixels that `_image_from_phases` undoes."""
+        """Equal ``conv(norm(upsample(coarse)))`` with edges repeated.
+
+        The pixels come in the order that `_image_from_phases` undoes.
+        """
         batch, _, height, width = coarse.shape
         edged = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
 

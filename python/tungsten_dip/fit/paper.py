@@ -6,7 +6,7 @@ image. This differs from the published code where that code
 
 - crops the image to a multiple of 32: here it is padded, and the output cropped back;
 - reads PNGs: here the images are not rounded to 8 bits, and channels of one value are left out;
-- mirrors the edge of every 3x3 convolution: here those after an upsampling repeat it (`networks`);
+- mirrors the edge of every 3x3 convolution: here those of the fine scales' way up repeat it (`networks`);
 - draws the input noise of every iteration anew: here it is a random window of a pool of Gaussian noise;
 - takes one more step, and skips the test at every hundredth iteration, when it backtracks.
 """
