@@ -20,10 +20,11 @@ namespace {
 
 using Array = py::array_t<float, py::array::c_style>;
 
+bool contiguous(const py::array& array) { return array.attr("flags").attr("c_contiguous").cast<bool>(); }
+
 std::string described(const py::array& array) {
     return py::str("{} of shape {}{}")
-        .format(array.dtype(), array.attr("shape"),
-                (array.flags() & py::array::c_style) != 0 ? "" : ", not C-contiguous");
+        .format(array.dtype(), array.attr("shape"), contiguous(array) ? "" : ", not C-contiguous");
 }
 
 // Only C++ knows that the data of inputs is not written to: numpy's read-only arrays are welcome.
@@ -32,8 +33,8 @@ Image image_from_array(const std::string& name, const py::array& array) {
         name + ": expected a C-contiguous float32 array of shape (height, width, channels), got ";
     if (!py::isinstance<py::array_t<float>>(array)) throw py::type_error(expected + described(array));
     constexpr py::ssize_t limit = std::numeric_limits<int>::max();
-    if (array.ndim() != 3 || (array.flags() & py::array::c_style) == 0 || array.shape(0) > limit ||
-        array.shape(1) > limit || array.shape(2) > limit) {
+    if (array.ndim() != 3 || !contiguous(array) || array.shape(0) > limit || array.shape(1) > limit ||
+        array.shape(2) > limit) {
         throw py::value_error(expected + described(array));
     }
     return {.data = static_cast<float*>(const_cast<void*>(array.data())),

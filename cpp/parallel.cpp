@@ -22,7 +22,7 @@ void parallel_for(int count, int threads, const std::function<void(int)>& body) 
             for (int i = next++; i < count; i = next++) body(i);
         } catch (...) {
             next = count;
-            const std::lock_guard lock(error_mutex);
+            const std::scoped_lock lock(error_mutex);
             if (!error) error = std::current_exception();
         }
     };

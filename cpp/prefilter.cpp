@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <numbers>
 #include <vector>
 
 #include "core.hpp"
@@ -15,6 +16,7 @@ namespace {
 
 // Bitterli et al. 2016, section 5.1, and the denoiser that its authors released with Tungsten.
 constexpr int patch_radius = 3;
+constexpr std::size_t patch_size = 2 * std::size_t{patch_radius} + 1;
 constexpr int window_radius = 5;
 constexpr float k_squared = 0.5F * 0.5F;
 
@@ -27,16 +29,18 @@ constexpr float largest_distance = 1e4F;
 constexpr int tile_size = 64;
 constexpr int padded_size = tile_size + 2 * patch_radius;
 
-// exp(-x) for x >= 0, relative error below 1e-6, as plain arithmetic that compilers vectorise: the whole part
-// of the binary logarithm becomes the exponent's bits, and a polynomial gives 2^fraction.
+// exp(-x) for 0 <= x < 87 to a relative error below 1e-5, then nearly 0: plain arithmetic that compilers
+// vectorise: the whole part of the binary logarithm becomes the exponent's bits, and a polynomial gives
+// 2^fraction.
 inline float exp_minus(float x) {
-    const float log2 = std::max(-1.44269504F * x, -126.0F) + 127.0F;
+    const float log2 = std::max(-std::numbers::log2e_v<float> * x, -126.0F) + 127.0F;
     const auto whole = static_cast<std::int32_t>(log2);
     const float f = log2 - static_cast<float>(whole);
+    // Fitted to a relative error below 1e-7.
     const float mantissa =
-        0.99999994F +
-        f * (0.69315308F + f * (0.24015363F + f * (0.05582631F + f * (0.00898935F + f * 0.00187757F))));
-    return std::bit_cast<float>(whole << 23) * mantissa;
+        0.99999994F + f * (0.69315308F +  // NOLINT(modernize-use-std-numbers): fitted, not ln 2
+                           f * (0.24015363F + f * (0.05582631F + f * (0.00898935F + f * 0.00187757F))));
+    return std::bit_cast<float>(static_cast<std::uint32_t>(whole) << 23U) * mantissa;
 }
 
 // An image's channels one after the other: [channel][y][x].
@@ -80,12 +84,16 @@ struct Range {
     int begin;
     int end;  // one past the last
 
-    [[nodiscard]] Range clipped(Range to) const { return {std::max(begin, to.begin), std::min(end, to.end)}; }
-    [[nodiscard]] Range grown(int by) const { return {begin - by, end + by}; }
+    [[nodiscard]] Range clipped(Range to) const {
+        return {.begin = std::max(begin, to.begin), .end = std::min(end, to.end)};
+    }
+    [[nodiscard]] Range grown(int by) const { return {.begin = begin - by, .end = end + by}; }
 };
 
 // The pixels of an axis that have a partner at the offset within the image.
-Range paired(int size, int offset) { return {std::max(0, -offset), std::min(size, size - offset)}; }
+Range paired(int size, int offset) {
+    return {.begin = std::max(0, -offset), .end = std::min(size, size - offset)};
+}
 
 // The same quantity of both halves.
 template <int size>
@@ -137,7 +145,7 @@ class TileFilter {
     [[nodiscard]] std::size_t tile_row(int y) const { return static_cast<std::size_t>(y - rows_.begin); }
     [[nodiscard]] std::size_t padded_row(int y) const { return tile_row(y) + patch_radius; }
     [[nodiscard]] std::size_t sum_row(int c, int y) const {
-        return static_cast<std::size_t>(c * tile_size) + tile_row(y);
+        return static_cast<std::size_t>(c) * tile_size + tile_row(y);
     }
 
     void add_offset(int dy, int dx) {
@@ -151,7 +159,7 @@ class TileFilter {
         // rest.
         std::array<float, tile_size> patch_width{};
         for (int x = columns.begin; x < columns.end; ++x) {
-            const Range patch = Range{x, x + 1}.grown(patch_radius).clipped(valid_columns);
+            const Range patch = Range{.begin = x, .end = x + 1}.grown(patch_radius).clipped(valid_columns);
             patch_width[static_cast<std::size_t>(x - columns_.begin)] =
                 static_cast<float>(patch.end - patch.begin);
         }
@@ -162,7 +170,8 @@ class TileFilter {
             sum_columns(patch_rows_[padded_row(y)]);
         }
         for (int y = rows.begin; y < rows.end; ++y) {
-            add_row(y, dy, dx, columns, Range{y, y + 1}.grown(patch_radius).clipped(valid_rows), patch_width);
+            add_row(y, dy, dx, columns,
+                    Range{.begin = y, .end = y + 1}.grown(patch_radius).clipped(valid_rows), patch_width);
         }
     }
 
@@ -196,7 +205,7 @@ class TileFilter {
 
     void sum_columns(HalvesRow<tile_size>& out) const {
         out = {};
-        for (std::size_t tap = 0; tap <= 2 * patch_radius; ++tap) {
+        for (std::size_t tap = 0; tap < patch_size; ++tap) {
             for (std::size_t i = 0; i < tile_size; ++i) out.a[i] += distances_.a[i + tap];
             for (std::size_t i = 0; i < tile_size; ++i) out.b[i] += distances_.b[i + tap];
         }

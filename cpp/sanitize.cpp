@@ -77,8 +77,8 @@ void for_each_position(const Image& image, const Visit& visit) {
 }
 
 float lower_median(std::array<float, 9>& values, int count) {
-    const auto middle = values.begin() + (count - 1) / 2;
-    std::nth_element(values.begin(), middle, values.begin() + count);
+    float* const middle = values.data() + (count - 1) / 2;
+    std::nth_element(values.data(), middle, values.data() + count);
     return *middle;
 }
 

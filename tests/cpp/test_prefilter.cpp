@@ -123,7 +123,7 @@ void leaves_clean_values_alone() {
             for (Pixels* plane : {&render.mean, &render.half_a, &render.half_b}) plane->at(y, x) = value;
         }
     }
-    Output clean(render, 1);
+    const Output clean(render, 1);
     CHECK(clean.mean == render.mean && clean.half_a == render.half_a && clean.half_b == render.half_b);
     CHECK(clean.variance == Pixels(70, 30, 1));
 

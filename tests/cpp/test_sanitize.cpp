@@ -107,8 +107,8 @@ void variance_follows_from_the_halves() {
     render.variance.at(2, 2) = -1;
     mend(render.buffer(), Quantity::color);
     CHECK(render.variance.at(1, 1) == 90000);
-    CHECK(render.variance.at(0, 0) == 90000 / 4);
-    CHECK(render.variance.at(2, 2) == 90000 / 4);
+    CHECK(render.variance.at(0, 0) == 22500);
+    CHECK(render.variance.at(2, 2) == 22500);
     CHECK(render.variance.at(0, 1) == 0);
 
     Pixels mean(1, 3, 1, 1.0F);

@@ -39,7 +39,7 @@ void halves_variance_is_that_of_the_mean() {
     CHECK(near(out.at(1, 2), std::pow(render.half_a.at(1, 2) - render.half_b.at(1, 2), 2) / 4, 1e-6));
     double sum = 0;
     for (const float value : out.values) sum += value;
-    const double count = static_cast<double>(out.values.size());
+    const auto count = static_cast<double>(out.values.size());
     // The variance of 8 samples' mean is 9/8; the standard error of its estimate is sqrt(2 / count) of that.
     CHECK(near(sum / count, 9.0 / 8, 4 * 9.0 / 8 * std::sqrt(2 / count)));
 }

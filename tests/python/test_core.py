@@ -1,0 +1,222 @@
+"""The core through numpy: what it refuses, what it shares, never changes, finds and mends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from conftest import MakeRender, SyntheticRender
+from tungsten_dip import _core
+from tungsten_dip.buffers import (
+    FEATURES,
+    Buffer,
+    FloatImage,
+    RenderBuffers,
+    halves_independent,
+    prefilter_features,
+    sanitize,
+    variance_of_mean,
+)
+
+SIZES = [(1, 1), (1, 9), (9, 1), (7, 5), (65, 67), (0, 4), (4, 0)]
+
+
+def _frozen_bytes(buffers: RenderBuffers) -> list[bytes]:
+    return [array.tobytes() for _, buffer in buffers.quantities() for _, array in buffer.planes()]
+
+
+def _noisy_color(height: int, width: int, spp: int = 8, mirror: float = 0.0, seed: int = 0) -> RenderBuffers:
+    """A flat grey whose samples alternate between A and B; ``mirror`` is minus the correlation of the two."""
+    rng = np.random.default_rng(seed)
+    a, fresh = rng.standard_normal((2, spp // 2, height, width, 3))
+    b = -mirror * a + np.sqrt(1 - mirror**2) * fresh
+    variance = np.concatenate([a, b]).var(axis=0, ddof=1) / spp
+    half_a, half_b = (5 + half.mean(axis=0) for half in (a, b))
+    planes = (array.astype(np.float32) for array in ((half_a + half_b) / 2, half_a, half_b, variance))
+    return RenderBuffers(color=Buffer(*planes))
+
+
+CALLS: list[Callable[[np.ndarray], object]] = [
+    lambda array: _core.sanitize("color", array, None, None, None),
+    lambda array: _core.halves_variance(array, array),
+    lambda array: _core.calibrate_variance(array, array, array),
+    lambda array: _core.compare_halves(array, array, None),
+    lambda array: _core.prefilter_feature(array, array, array, None),
+]
+
+
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.uint8, np.int32])
+def test_other_dtypes_are_refused(call: Callable[[np.ndarray], object], dtype: type) -> None:
+    with pytest.raises(
+        TypeError, match=r"expected a C-contiguous float32 array .* got .*of shape \(4, 5, 3\)"
+    ):
+        call(np.zeros((4, 5, 3), dtype))
+
+
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((4, 5, 3), np.float32, order="F"),
+        np.zeros((8, 5, 3), np.float32)[::2],
+        np.zeros((4, 5), np.float32),
+        np.zeros((1, 4, 5, 3), np.float32),
+    ],
+)
+def test_other_layouts_are_refused(call: Callable[[np.ndarray], object], array: FloatImage) -> None:
+    with pytest.raises(ValueError, match="expected a C-contiguous float32 array of shape"):
+        call(array)
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_lists_are_refused(call: Callable[[np.ndarray], object]) -> None:
+    with pytest.raises(TypeError):
+        call([[[0.0]]])  # type: ignore[arg-type]
+
+
+def test_shapes_must_agree() -> None:
+    image, other = np.zeros((4, 5, 3), np.float32), np.zeros((5, 4, 3), np.float32)
+    with pytest.raises(
+        ValueError, match=r"half_b: expected the shape of the others, \(4, 5, 3\), got \(5, 4, 3\)"
+    ):
+        _core.halves_variance(image, other)
+    with pytest.raises(ValueError, match="variance: expected the shape"):
+        _core.compare_halves(image, image, other)
+    with pytest.raises(ValueError, match="quantity: expected color, albedo"):
+        _core.sanitize("colour", image, None, None, None)
+
+
+def test_sane_buffers_are_shared(render: SyntheticRender) -> None:
+    for _, buffer in render.buffers.quantities():
+        for _, array in buffer.planes():
+            if buffer is not render.buffers.normal:
+                np.maximum(array, 0, out=array)
+            array.flags.writeable = False
+    mended, lines = sanitize(render.buffers)
+    assert lines == ()
+    for (_, before), (_, after) in zip(render.buffers.quantities(), mended.quantities(), strict=True):
+        for (_, old), (_, new) in zip(before.planes(), after.planes(), strict=True):
+            assert new is old
+
+
+def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) -> None:
+    buffers = render.buffers
+    color, albedo = buffers.color, buffers.albedo
+    assert color.half_a is not None
+    assert color.half_b is not None
+    assert albedo is not None
+    assert albedo.variance is not None
+    color.half_a[2, 3] = 7
+    color.half_b[2, 3] = 3
+    color.mean[2, 3] = np.nan
+    color.mean[5, 5, 0] = -1
+    color.mean[6, 6, 1] = 1e30
+    albedo.variance[4:6] = np.inf
+    before = _frozen_bytes(buffers)
+
+    mended, lines = sanitize(buffers)
+
+    assert _frozen_bytes(buffers) == before
+    color_line, albedo_line = (next(line for line in lines if name in line) for name in ("color", "albedo"))
+    assert color_line == "mended color 3 NaN, 1 negative"
+    assert f"albedo variance {2 * buffers.width * 3} infinite" in albedo_line
+    np.testing.assert_array_equal(mended.color.mean[2, 3], [5, 5, 5])
+    assert mended.color.mean[5, 5, 0] == 0
+    assert mended.color.mean[6, 6, 1] == np.float32(1e30)
+    assert mended.color.half_a is color.half_a
+    for _, buffer in mended.quantities():
+        assert all(np.isfinite(array).all() for _, array in buffer.planes())
+    assert sanitize(mended)[1] == ()
+
+
+def test_without_halves_the_neighbours_tell() -> None:
+    mean = np.full((3, 3, 3), 2, np.float32)
+    variance = np.full((3, 3, 3), 0.5, np.float32)
+    mean[1, 1], variance[1, 1], variance[0, 0] = np.inf, np.nan, 0.75
+    mended, lines = sanitize(RenderBuffers(color=Buffer(mean, variance=variance)))
+    assert lines == ("mended color 3 infinite; color variance 3 NaN",)
+    np.testing.assert_array_equal(mended.color.mean, 2)
+    assert mended.color.variance is not None
+    np.testing.assert_array_equal(mended.color.variance[1, 1], 0.75)
+
+
+@pytest.mark.parametrize("shape", SIZES)
+def test_every_size_passes_through_everything(shape: tuple[int, int], make_render: MakeRender) -> None:
+    color = _noisy_color(*shape).color
+    normal = Buffer(color.mean - 5, color.half_a, color.half_b, color.variance)
+    nowhere = Buffer(np.full((*shape, 1), np.nan, np.float32))
+    buffers, lines = sanitize(RenderBuffers(color=color, normal=normal, depth=nowhere))
+    assert lines == ((f"mended depth {shape[0] * shape[1]} NaN",) if shape[0] * shape[1] else ())
+    assert buffers.depth is not None
+    np.testing.assert_array_equal(buffers.depth.mean, np.zeros((*shape, 1)))
+    filtered = prefilter_features(buffers)
+    assert filtered.normal is not None
+    assert all(
+        np.isfinite(array).all() and array.shape == (*shape, 3) for _, array in filtered.normal.planes()
+    )
+    assert filtered.depth is buffers.depth
+    assert halves_independent(buffers).independent == (shape == (65, 67))
+
+
+def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
+    independent = halves_independent(_noisy_color(96, 80))
+    assert independent.independent
+    assert abs(independent.correlation) < 0.1
+    assert independent.variance_ratio == pytest.approx(1, abs=0.1)
+    assert independent.pixels_used >= 96 * 80 / 3
+
+    mirrored = halves_independent(_noisy_color(96, 80, mirror=0.5))
+    assert not mirrored.independent
+    assert mirrored.correlation == pytest.approx(-0.5, abs=0.1)
+
+    color = _noisy_color(96, 80).color
+    copied = halves_independent(
+        RenderBuffers(color=Buffer(color.mean, color.half_a, color.half_a, color.variance))
+    )
+    assert (copied.independent, copied.correlation) == (False, 1.0)
+
+    alone = halves_independent(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
+    assert (alone.independent, alone.pixels_used) == (False, 0)
+
+
+def test_variance_of_mean_uses_what_there_is() -> None:
+    mean, half_a, half_b, variance = (array for _, array in _noisy_color(40, 41).color.planes())
+    assert variance_of_mean(Buffer(mean)) is None
+    assert variance_of_mean(Buffer(mean, variance=variance)) is variance
+    from_halves = variance_of_mean(Buffer(mean, half_a, half_b))
+    np.testing.assert_allclose(from_halves, (half_a - half_b) ** 2 / 4, rtol=1e-6)
+    calibrated = variance_of_mean(Buffer(mean, half_a, half_b, 3 * variance))
+    assert calibrated is not None
+    assert calibrated.mean() == pytest.approx(1 / 8, rel=0.1)
+
+
+def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRender) -> None:
+    noisy, truth = make_render(seed=1).buffers, make_render(spp=4, seed=2).buffers
+    assert noisy.normal is not None
+    assert truth.normal is not None
+    clean = Buffer(truth.normal.mean, truth.normal.mean, truth.normal.mean, np.zeros_like(truth.normal.mean))
+    buffers = noisy.with_quantities(normal=clean)
+    before = _frozen_bytes(buffers)
+    filtered = prefilter_features(buffers)
+    assert _frozen_bytes(buffers) == before
+    assert filtered.color is buffers.color
+    assert filtered.normal is not None
+    np.testing.assert_array_equal(filtered.normal.mean, clean.mean)
+
+    reference = np.mean([make_render(seed=seed).buffers.albedo.mean for seed in range(10, 40)], axis=0)
+    assert buffers.albedo is not None
+    assert filtered.albedo is not None
+    noise = np.mean((buffers.albedo.mean - reference) ** 2)
+    # The floor's fine checkers have few equals to average with; on plain surfaces far less is left.
+    assert np.mean((filtered.albedo.mean - reference) ** 2) < 0.6 * noise
+
+
+def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
+    buffers = make_render(height=71, width=133).buffers
+    one, many = prefilter_features(buffers, threads=1), prefilter_features(buffers, threads=5)
+    assert _frozen_bytes(one) == _frozen_bytes(many)
+    assert halves_independent(buffers, 1).correlation == halves_independent(buffers, 5).correlation
+    assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
