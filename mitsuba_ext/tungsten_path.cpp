@@ -70,7 +70,7 @@ using MediumHit = Variant::MediumInteraction3f;
 using Vertex = Variant::Interaction3f;
 
 // Mitsuba's types are laid out for the instruction set that the wheel was compiled for.
-#if defined(__x86_64__)
+#ifdef __x86_64__
 static_assert(sizeof(Point3) == 16, "compile for x86-64-v3, as Mitsuba's wheel is");
 #endif
 
@@ -192,7 +192,7 @@ class Sample {
 class Accumulator {
   public:
     void add(const std::array<float, 3>& sample) {
-        if (!std::all_of(sample.begin(), sample.end(), [](float x) { return std::isfinite(x); })) return;
+        if (!std::ranges::all_of(sample, [](float x) { return std::isfinite(x); })) return;
         const size_t half = count_ & 1U;
         ++count_;
         for (size_t c = 0; c < 3; ++c) {
@@ -229,6 +229,27 @@ float power_heuristic(float pdf, float other) {
 
 bool is_black(const Rgb& value) { return !(dr::max(value) > 0.f); }
 
+// A path on its way from the camera.
+struct Path {  // NOLINT(clang-analyzer-optin.performance.Padding): fields in the order of their meaning
+    Ray3 ray;
+    const Variant::Medium* medium;
+    SurfaceHit hit;  // what the ray meets
+    Sample* sample;
+    bool is_recorded;  // whether the features are settled
+    Rgb radiance{0.f};
+    Rgb throughput{1.f};
+    int bounce = 0;
+    int medium_bounces = 0;
+    float distance = 0.f;  // to the last surface, along the path
+    Point3 segment_start;
+    bool was_specular = true;
+    // The last vertex that scattered, the pdf of the direction it chose, and whether emitters were sampled
+    // there.
+    Vertex vertex = dr::zeros<Vertex>();
+    float direction_pdf = 0.f;
+    bool samples_lights = false;
+};
+
 // How a path goes on from a surface.
 struct Scattering {
     enum Kind : uint8_t { none, forward, specular, smooth };
@@ -246,7 +267,7 @@ class TungstenPath final : public Variant::Integrator {
     using Medium = Variant::Medium;
     using Emitter = Variant::Emitter;
     using Texture = Variant::Texture;
-    using TensorXf = Base::TensorXf;
+    using Base::TensorXf;
 
     explicit TungstenPath(const Properties& properties)
         : Base(properties),
@@ -263,7 +284,7 @@ class TungstenPath final : public Variant::Integrator {
         std::istringstream names{std::string(
             properties.get<std::string_view>("quantities", "color albedo normal depth visibility"))};
         for (std::string name; names >> name;) {
-            const auto* found = std::find(quantity_names.begin(), quantity_names.end(), name);
+            const auto* found = std::ranges::find(quantity_names, name);
             if (found == quantity_names.end()) Throw("quantities: unknown quantity \"%s\"", name);
             quantities_.push_back(static_cast<Quantity>(found - quantity_names.begin()));
         }
@@ -272,8 +293,8 @@ class TungstenPath final : public Variant::Integrator {
             if (property.name().starts_with(prefix))
                 albedos_.emplace(property.name().substr(prefix.size()),
                                  properties.get_unbounded_texture<Texture>(property.name()));
-        records_features_ = std::any_of(quantities_.begin(), quantities_.end(),
-                                        [](Quantity quantity) { return quantity != color; });
+        records_features_ =
+            std::ranges::any_of(quantities_, [](Quantity quantity) { return quantity != color; });
     }
 
     void traverse(TraversalCallback* callback) override {
@@ -312,7 +333,7 @@ class TungstenPath final : public Variant::Integrator {
             },
             pool.get());
         const std::array<size_t, 3> shape{size.y(), size.x(), channels};
-        return TensorXf(image.data(), shape.size(), shape.data());
+        return {image.data(), shape.size(), shape.data()};
     }
 
     std::string to_string() const override {
@@ -331,7 +352,7 @@ class TungstenPath final : public Variant::Integrator {
     // Whether a shadow ray can be anything but blocked or free.
     static bool has_transparency(const Scene& scene) {
         if ((scene.shape_types() & +ShapeType::Instance) != 0) return true;  // what is in it is not listed
-        return std::any_of(scene.shapes().begin(), scene.shapes().end(), [](const auto& shape) {
+        return std::ranges::any_of(scene.shapes(), [](const auto& shape) {
             return shape->is_medium_transition() ||
                    (shape->bsdf() && has_flag(shape->bsdf()->flags(), BSDFFlags::Null));
         });
@@ -369,134 +390,126 @@ class TungstenPath final : public Variant::Integrator {
         ray.maxt = dr::Largest<float>;
     }
 
-    // Follows one path. Features are recorded at the first surface where the path does not go on specularly
-    // or straight ahead; a path that a medium or chance ends before says nothing of them.
-    Rgb radiance(const Scene& scene, const Medium* medium, Ray3 ray, Random& random, Sample& sample) const {
-        Rgb result(0.f);
-        Rgb throughput(1.f);
-        bool recorded = !records_features_;
-        float distance = 0.f;
-        Point3 segment_start = ray.o;
-        int bounce = 0;
-        int medium_bounces = 0;
-        bool was_specular = true;
-        // The last vertex that scattered; emitters were sampled there if `samples_lights`.
-        Vertex vertex = dr::zeros<Vertex>();
-        float direction_pdf = 0.f;
-        bool samples_lights = false;
-
-        const auto emitted = [&](const SurfaceHit& hit, const Emitter& emitter) -> Rgb {
-            const Rgb emission = emitter.eval(hit);
-            if (was_specular || !samples_lights || is_black(emission)) return emission;
-            const Variant::DirectionSample3f towards(&scene, hit, vertex);
-            return emission * power_heuristic(direction_pdf, scene.pdf_emitter_direction(vertex, towards));
-        };
-
-        SurfaceHit hit = scene.ray_intersect(ray);
-        while ((hit.is_valid() || medium != nullptr) && bounce < max_bounces_) {
-            MediumHit medium_hit = dr::zeros<MediumHit>();
-            bool in_medium =
-                medium != nullptr && scatters(*medium, ray, hit.t, random, throughput, medium_hit);
-            if (!in_medium && !hit.is_valid()) break;
-
-            if (in_medium) {
-                ++medium_bounces;
-                samples_lights = volume_light_sampling_ && (medium_bounces > 1 || low_order_scattering_);
-                was_specular = !samples_lights;
-                const Variant::PhaseFunctionContext context(nullptr);
-                const auto* phase = medium->phase_function();
-                if (samples_lights && bounce < max_bounces_ - 1)
-                    result +=
-                        throughput *
-                        light_from(scene, medium_hit, bounce + 1, random, [&](const Vector3& direction) {
-                            return LightTransport{phase->eval_pdf(context, medium_hit, direction), medium};
-                        });
-                const float lobe = random.next();
-                const auto [direction, weight, pdf] =
-                    phase->sample(context, medium_hit, lobe, random.next_2d());
-                if (!(pdf > 0.f)) return result;
-                throughput *= weight;
-                vertex = medium_hit;
-                direction_pdf = pdf;
-                segment_start = medium_hit.p;
-                ray = medium_hit.spawn_ray(direction);
-            } else {
-                distance += dr::norm(hit.p - segment_start);
-                if (medium_bounces == 1 && !low_order_scattering_) return result;
-                const auto& bsdf = *hit.bsdf();
-                const Emitter* emitter = hit.shape->emitter();
-                const Scattering next = scatter(bsdf, hit, random);
-                const Vector3 direction = hit.to_world(next.local_direction);
-                const bool goes_on =
-                    next.kind == Scattering::forward ||
-                    (next.kind != Scattering::none && consistent(hit, direction, next.local_direction));
-                // A BSDF that lets a share of the rays through says so in `eval`: its light is gathered
-                // whether or not this ray goes on, and not only where it does not.
-                const bool gathers_light = light_sampling_ && (medium_bounces > 0 || include_surfaces_) &&
-                                           has_flag(bsdf.flags(), BSDFFlags::Smooth);
-                std::optional<float> light_visibility;
-                if (gathers_light && bounce < max_bounces_ - 1)
-                    result += throughput *
-                              light_from(
-                                  scene, hit, bounce + 1, random,
-                                  [&](const Vector3& towards) {
-                                      const Vector3 local = hit.to_local(towards);
-                                      if (!consistent(hit, towards, local)) return LightTransport{};
-                                      return LightTransport{
-                                          bsdf.eval_pdf(BSDFContext(), hit, local),
-                                          hit.is_medium_transition() ? hit.target_medium(towards) : medium};
-                                  },
-                                  &light_visibility);
-                if (next.kind != Scattering::forward) {
-                    if (emitter != nullptr && bounce >= min_bounces_)
-                        result += throughput * emitted(hit, *emitter);
-                    samples_lights = gathers_light;
-                    if (goes_on) {
-                        was_specular = next.kind == Scattering::specular;
-                        vertex = hit;
-                        direction_pdf = next.pdf;
-                    }
-                }
-                if (medium_bounces == 0 && !include_surfaces_ && has_flag(bsdf.flags(), BSDFFlags::Smooth))
-                    return result;
-
-                if (!recorded && (!was_specular || !goes_on)) {
-                    recorded = true;
-                    sample.set(depth, distance);
-                    sample.set(normal, Vector3(hit.sh_frame.n));
-                    sample.set(albedo, surface_albedo(bsdf, hit) +
-                                           (emitter != nullptr ? emitter->eval(hit) : Rgb(0.f)));
-                    if (light_visibility) sample.set(visibility, *light_visibility);
-                }
-                if (!goes_on) return result;
-                throughput *= next.weight;
-                if (hit.is_medium_transition()) medium = hit.target_medium(direction);
-                segment_start = hit.p;
-                ray = hit.spawn_ray(direction);
+    // Follows one path. Features are recorded at the first surface where it does not go on specularly or
+    // straight ahead; a path that a medium or chance ends before says nothing of them.
+    Rgb radiance(const Scene& scene, const Medium* medium, const Ray3& ray, Random& random,
+                 Sample& sample) const {
+        Path path{.ray = ray,
+                  .medium = medium,
+                  .hit = scene.ray_intersect(ray),
+                  .sample = &sample,
+                  .is_recorded = !records_features_,
+                  .segment_start = ray.o};
+        while ((path.hit.is_valid() || path.medium != nullptr) && path.bounce < max_bounces_) {
+            auto medium_hit = dr::zeros<MediumHit>();
+            const bool in_medium = path.medium != nullptr && scatters(*path.medium, path.ray, path.hit.t,
+                                                                      random, path.throughput, medium_hit);
+            if (!in_medium && !path.hit.is_valid()) break;
+            const bool goes_on =
+                in_medium ? pass_medium(scene, medium_hit, random, path) : pass_surface(scene, random, path);
+            if (!goes_on) return path.radiance;
+            if (is_black(path.throughput)) break;
+            const float survival = dr::max(path.throughput);
+            if (path.bounce > 2 && survival < 0.1f) {
+                if (random.next() >= survival) return path.radiance;
+                path.throughput /= survival;
             }
+            ++path.bounce;
+            if (path.bounce < max_bounces_) path.hit = scene.ray_intersect(path.ray);
+        }
+        leave(scene, path);
+        return path.radiance;
+    }
 
-            if (is_black(throughput)) break;
-            const float survival = dr::max(throughput);
-            if (bounce > 2 && survival < 0.1f) {
-                if (random.next() >= survival) return result;
-                throughput /= survival;
+    // Scatters in the medium; returns whether the path goes on.
+    bool pass_medium(const Scene& scene, const MediumHit& hit, Random& random, Path& path) const {
+        ++path.medium_bounces;
+        path.samples_lights = volume_light_sampling_ && (path.medium_bounces > 1 || low_order_scattering_);
+        path.was_specular = !path.samples_lights;
+        const Variant::PhaseFunctionContext context(nullptr);
+        const auto* phase = path.medium->phase_function();
+        if (path.samples_lights && path.bounce < max_bounces_ - 1) {
+            const LightSample light = sample_light(scene, hit, random);
+            const auto [value, pdf] = phase->eval_pdf(context, hit, light.direction.d);
+            light_from(scene, hit, light, value, pdf, path.medium, random, path);
+        }
+        const float lobe = random.next();
+        const auto [direction, weight, pdf] = phase->sample(context, hit, lobe, random.next_2d());
+        if (!(pdf > 0.f)) return false;
+        path.throughput *= weight;
+        path.vertex = hit;
+        path.direction_pdf = pdf;
+        path.segment_start = hit.p;
+        path.ray = hit.spawn_ray(direction);
+        return true;
+    }
+
+    // Scatters at the surface, or passes it; returns whether the path goes on.
+    bool pass_surface(const Scene& scene, Random& random, Path& path) const {
+        const SurfaceHit& hit = path.hit;
+        path.distance += dr::norm(hit.p - path.segment_start);
+        if (path.medium_bounces == 1 && !low_order_scattering_) return false;
+        const auto& bsdf = *hit.bsdf();
+        const bool has_smooth_lobe = has_flag(bsdf.flags(), BSDFFlags::Smooth);
+        const Emitter* emitter = hit.shape->emitter();
+        const Scattering next = scatter(bsdf, hit, random);
+        const Vector3 direction = hit.to_world(next.local_direction);
+        bool goes_on = next.kind != Scattering::none;
+        std::optional<float> light_visibility;
+        if (next.kind != Scattering::forward) {
+            goes_on = goes_on && is_consistent(hit, direction, next.local_direction);
+            if (emitter != nullptr && path.bounce >= min_bounces_)
+                path.radiance += path.throughput * emitted(scene, hit, *emitter, path);
+            path.samples_lights =
+                light_sampling_ && (path.medium_bounces > 0 || include_surfaces_) && has_smooth_lobe;
+            if (path.samples_lights && path.bounce < max_bounces_ - 1)
+                light_visibility = light_from_surface(scene, bsdf, random, path);
+            if (goes_on) {
+                path.was_specular = next.kind == Scattering::specular;
+                path.vertex = hit;
+                path.direction_pdf = next.pdf;
             }
-            ++bounce;
-            if (bounce < max_bounces_) hit = scene.ray_intersect(ray);
         }
+        if (path.medium_bounces == 0 && !include_surfaces_ && has_smooth_lobe) return false;
 
-        const bool meets_sky =
-            scene.environment() != nullptr && bounce >= min_bounces_ && bounce < max_bounces_;
-        SurfaceHit sky = dr::zeros<SurfaceHit>();
-        sky.t = dr::Infinity<float>;
-        sky.wi = -ray.d;
-        if (meets_sky) result += throughput * emitted(sky, *scene.environment());
-        if (!recorded) {
-            if (bounce == 0) sample.set(depth, 0.f);
-            sample.set(normal, -ray.d);
-            if (meets_sky) sample.set(albedo, Rgb(scene.environment()->eval(sky)));
+        if (!path.is_recorded && (!path.was_specular || !goes_on)) {
+            path.is_recorded = true;
+            path.sample->set(depth, path.distance);
+            path.sample->set(normal, Vector3(hit.sh_frame.n));
+            path.sample->set(
+                albedo, surface_albedo(bsdf, hit) + (emitter != nullptr ? emitter->eval(hit) : Rgb(0.f)));
+            if (light_visibility) path.sample->set(visibility, *light_visibility);
         }
-        return result;
+        if (!goes_on) return false;
+        path.throughput *= next.weight;
+        if (hit.is_medium_transition()) path.medium = hit.target_medium(direction);
+        path.segment_start = hit.p;
+        path.ray = hit.spawn_ray(direction);
+        return true;
+    }
+
+    // Ends a path that no surface stopped.
+    void leave(const Scene& scene, Path& path) const {
+        const Emitter* sky =
+            path.bounce >= min_bounces_ && path.bounce < max_bounces_ ? scene.environment() : nullptr;
+        auto hit = dr::zeros<SurfaceHit>();
+        hit.t = dr::Infinity<float>;
+        hit.wi = -path.ray.d;
+        if (sky != nullptr) path.radiance += path.throughput * emitted(scene, hit, *sky, path);
+        if (path.is_recorded) return;
+        if (path.bounce == 0) path.sample->set(depth, 0.f);
+        path.sample->set(normal, -path.ray.d);
+        if (sky != nullptr) path.sample->set(albedo, Rgb(sky->eval(hit)));
+    }
+
+    // What an emitter sends back along the ray, weighted against the sampling of emitters at the vertex
+    // before.
+    static Rgb emitted(const Scene& scene, const SurfaceHit& hit, const Emitter& emitter, const Path& path) {
+        const Rgb emission = emitter.eval(hit);
+        if (path.was_specular || !path.samples_lights || is_black(emission)) return emission;
+        const Variant::DirectionSample3f towards(&scene, hit, path.vertex);
+        return emission *
+               power_heuristic(path.direction_pdf, scene.pdf_emitter_direction(path.vertex, towards));
     }
 
     static Scattering scatter(const Variant::BSDF& bsdf, const SurfaceHit& hit, Random& random) {
@@ -514,8 +527,8 @@ class TungstenPath final : public Variant::Integrator {
         return result;
     }
 
-    [[nodiscard]] bool consistent(const SurfaceHit& hit, const Vector3& direction,
-                                  const Vector3& local) const {
+    [[nodiscard]] bool is_consistent(const SurfaceHit& hit, const Vector3& direction,
+                                     const Vector3& local) const {
         return !consistency_checks_ || (dr::dot(hit.n, direction) < 0.f) == (local.z() < 0.f);
     }
 
@@ -539,7 +552,7 @@ class TungstenPath final : public Variant::Integrator {
             // colour noise low.
             const auto channel = static_cast<uint32_t>(3.f * random.next());
             hit = medium.sample_interaction(ray, random.next(), std::min(channel, 2U), true);
-            SurfaceHit surface = dr::zeros<SurfaceHit>();
+            auto surface = dr::zeros<SurfaceHit>();
             surface.t = surface_t;
             const auto [transmittance, pdf] = medium.transmittance_eval_pdf(hit, surface, true);
             const float mean_pdf = dr::mean(pdf);
@@ -564,27 +577,42 @@ class TungstenPath final : public Variant::Integrator {
         }
     }
 
-    // How a vertex passes light on: its value and pdf for a direction, and the medium that lies there.
-    struct LightTransport {
-        std::pair<Rgb, float> value_pdf{0.f, 0.f};
-        const Medium* medium = nullptr;
+    struct LightSample {
+        Variant::DirectionSample3f direction;
+        Rgb weight;  // radiance over pdf, unless something is in the way
     };
 
-    // The light that one sampled emitter sends along the path through `from`; `visibility` is how much of it
-    // arrives.
-    template <typename Hit, typename Transport>
-    Rgb light_from(const Scene& scene, const Hit& from, int bounce, Random& random,
-                   const Transport& transport, std::optional<float>* visibility_out = nullptr) const {
-        const auto [towards, emission] = scene.sample_emitter_direction(from, random.next_2d(), false);
-        if (!(towards.pdf > 0.f)) return {0.f};
-        const LightTransport vertex = transport(towards.d);
-        const auto& [value, pdf] = vertex.value_pdf;
-        if (is_black(value)) return {0.f};
+    template <typename Hit>
+    static LightSample sample_light(const Scene& scene, const Hit& from, Random& random) {
+        const auto [direction, weight] = scene.sample_emitter_direction(from, random.next_2d(), false);
+        return {.direction = direction, .weight = weight};
+    }
+
+    // Adds the light that `from`, of this value and pdf, passes on from a sampled emitter through a medium.
+    // Returns how much of it arrives, or nothing if it was not asked.
+    template <typename Hit>
+    std::optional<float> light_from(const Scene& scene, const Hit& from, const LightSample& light,
+                                    const Rgb& value, float pdf, const Medium* medium, Random& random,
+                                    Path& path) const {
+        if (!(light.direction.pdf > 0.f) || is_black(value)) return {};
+        const Point3& target = light.direction.p;
         const Rgb passed =
-            transmittance(scene, from.spawn_ray_to(towards.p), towards.p, vertex.medium, bounce, random);
-        if (visibility_out != nullptr) *visibility_out = dr::mean(passed);
-        const float weight = towards.delta ? 1.f : power_heuristic(towards.pdf, pdf);
-        return value * emission * passed * weight;
+            transmittance(scene, from.spawn_ray_to(target), target, medium, path.bounce + 1, random);
+        const float weight = light.direction.delta ? 1.f : power_heuristic(light.direction.pdf, pdf);
+        path.radiance += path.throughput * value * light.weight * passed * weight;
+        return dr::mean(passed);
+    }
+
+    std::optional<float> light_from_surface(const Scene& scene, const Variant::BSDF& bsdf, Random& random,
+                                            Path& path) const {
+        const SurfaceHit& hit = path.hit;
+        const LightSample light = sample_light(scene, hit, random);
+        const Vector3 local = hit.to_local(light.direction.d);
+        if (!is_consistent(hit, light.direction.d, local)) return {};
+        const auto [value, pdf] = bsdf.eval_pdf(BSDFContext(), hit, local);
+        const Medium* medium =
+            hit.is_medium_transition() ? hit.target_medium(light.direction.d) : path.medium;
+        return light_from(scene, hit, light, value, pdf, medium, random, path);
     }
 
     // What of the light reaches `target` along a ray; every transparent surface on the way is a bounce.
@@ -593,13 +621,15 @@ class TungstenPath final : public Variant::Integrator {
         if (!sees_through_ && medium == nullptr)
             return {bounce < min_bounces_ || scene.ray_test(ray) ? 0.f : 1.f};
         for (Rgb result(1.f);;) {
-            const SurfaceHit hit = scene.ray_intersect(ray);
-            if (hit.is_valid()) {
-                result *= hit.bsdf()->eval_null_transmission(hit);
-                if (is_black(result) || ++bounce >= max_bounces_) return {0.f};
-            }
-            if (medium != nullptr) result *= transmittance(*medium, ray, std::min(hit.t, ray.maxt), random);
-            if (!hit.is_valid()) return bounce >= min_bounces_ ? result : Rgb(0.f);
+            auto preliminary = scene.ray_intersect_preliminary(ray);
+            const bool is_hit = preliminary.is_valid();
+            if (is_hit && !has_flag(preliminary.shape->bsdf()->flags(), BSDFFlags::Null)) return {0.f};
+            const float distance = is_hit ? preliminary.t : ray.maxt;
+            if (medium != nullptr) result *= transmittance(*medium, ray, distance, random);
+            if (!is_hit) return bounce >= min_bounces_ ? result : Rgb(0.f);
+            const SurfaceHit hit = preliminary.compute_surface_interaction(ray);
+            result *= hit.bsdf()->eval_null_transmission(hit);
+            if (is_black(result) || ++bounce >= max_bounces_) return {0.f};
             if (hit.is_medium_transition()) medium = hit.target_medium(ray.d);
             ray = hit.spawn_ray_to(target);
         }
