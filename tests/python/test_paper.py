@@ -181,6 +181,7 @@ def test_backtracks_from_nan():
         next(fit.network.parameters()).fill_(float("nan"))
     fit.step()
     assert all(torch.isfinite(weight).all() for weight in fit.network.parameters())
+    assert np.isfinite(fit.color()).all()
 
 
 def test_output_is_the_running_average(monkeypatch):
@@ -249,6 +250,13 @@ def test_one_pixel_and_none():
     )
     with pytest.raises(InputError, match="at least one pixel, got 5x0"):
         fit_paper(noise_buffers(0, 5), settings())
+
+
+def test_nan_is_refused():
+    buffers = noise_buffers()
+    buffers.albedo.mean[2, 3, 1] = np.nan
+    with pytest.raises(InputError, match="without NaN"):
+        fit_paper(buffers, settings())
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

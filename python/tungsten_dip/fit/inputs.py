@@ -55,7 +55,8 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     (``ioc``): only random channels go in, colour and all features come out. ``all`` holds the noisy colour
     too. Channels of one value carry nothing and are left out.
 
-    Raises InputError if a feature that was asked for by name is missing, or nothing at all would go in.
+    Raises InputError if a feature that was asked for by name is missing, a value is NaN, or nothing at all
+    would go in.
     """
     color = ldr_from_radiance(buffers.color.mean)
     features = [color] if settings.scheme == "iic" and settings.inputs.startswith("all") else []
@@ -81,6 +82,8 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
             features += _ldr_from_feature(quantity, buffer)
 
     stack = np.concatenate([color[:, :, :0], *features], axis=2)
+    if np.isnan(stack).any() or np.isnan(color).any():
+        raise InputError("expected buffers without NaN, found NaN; sanitise them first")
     varies = stack.min(axis=(0, 1)) < stack.max(axis=(0, 1))
     if not varies.all():
         notes.append(f"{np.count_nonzero(~varies)} of {varies.size} feature channels are constant: left out")

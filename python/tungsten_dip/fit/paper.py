@@ -8,7 +8,7 @@ image. This differs from the published code where that code
 - reads PNGs: here the images are not rounded to 8 bits, and channels of one value are left out;
 - mirrors the edge of every 3x3 convolution: here those of the fine scales' way up repeat it (`networks`);
 - draws the input noise of every iteration anew: here it is a random window of a pool of Gaussian noise;
-- takes one more step, and skips the test at every hundredth iteration, when it backtracks.
+- averages the output that made it backtrack and takes a step from it: here that iteration only goes back.
 """
 
 from __future__ import annotations
@@ -95,11 +95,6 @@ class PaperFit:
         output = self.network(self._noisy_input)
         loss = F.mse_loss(output, self._wanted)
         seen = output.detach()
-        if self._average is None:
-            self._average = seen.clone()
-        else:
-            self._average.lerp_(seen, 1 - AVERAGE_WEIGHT)
-
         self.loss = loss.item()
         color_loss = self.loss if seen.shape[1] == 3 else F.mse_loss(seen[:, :3], self._wanted[:, :3]).item()
         self.psnr = -10 * math.log10(max(color_loss, 1e-12))
@@ -110,6 +105,10 @@ class PaperFit:
         with torch.no_grad():
             torch._foreach_copy_(self._good_weights, self._weights)
         self._last_good_psnr = self.psnr
+        if self._average is None:
+            self._average = seen.clone()
+        else:
+            self._average.lerp_(seen, 1 - AVERAGE_WEIGHT)
 
         self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -136,8 +135,8 @@ def fit_paper(buffers: RenderBuffers, settings: FitSettings, progress: Progress 
     the first iteration. An interrupt (KeyboardInterrupt) after it ends the fit with the average so far. On a
     CPU, the same seed and number of threads give the same bits.
 
-    Raises InputError if the image is empty, a feature named by the inputs is missing or the device is not
-    there.
+    Raises InputError if the image is empty or holds NaN, a feature named by the inputs is missing or the
+    device is not there.
     """
     start = time.perf_counter()
     if buffers.color.mean.size == 0:
