@@ -7,7 +7,9 @@ largest scale of a sphere, say), and so does this.
 
 from __future__ import annotations
 
+import logging
 import math
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -22,6 +24,8 @@ from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import mesh_geometry
 
 _Array = npt.NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
 
 # From Mitsuba's UV to Tungsten's.
 _DISK_UV = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -52,6 +56,8 @@ def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
             return [_disk(t, primitive)]
         case ts.Cylinder():
             return _cylinder(t, primitive)
+        case ts.Instances():
+            return _instances(t, primitive)
     raise t.unsupported(f"a primitive of type {primitive.kind}")
 
 
@@ -206,6 +212,39 @@ def _cylinder(t: Translation, primitive: ts.Cylinder) -> list[Node]:
                 }
             )
     return shapes
+
+
+def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
+    if primitive.file_a is not None or primitive.file_b is not None:
+        raise t.unsupported("a file of instances")
+    groups = []
+    for master in primitive.masters:
+        if not isinstance(master, ts.Quad | ts.Disk):
+            _log.warning(
+                "%s: %s: Tungsten lights instances of a %s from the wrong places; here they are right",
+                t.source.path,
+                t.place,
+                master.kind,
+            )
+        # Masters do not shine, and the media are those of the instances.
+        bare = replace(
+            master,
+            emission=None,
+            power=None,
+            int_medium=primitive.int_medium,
+            ext_medium=primitive.ext_medium,
+        )
+        shapes = {f"shape_{number}": shape for number, shape in enumerate(_shapes(t, bare))}
+        groups.append(t.add("shapegroup", {"type": "shapegroup", **shapes}))
+    _, rotation, _ = _parts(primitive.world_from_local)
+    nodes = []
+    for placement in primitive.instances:
+        origin, turn, _ = _parts(placement.world_from_local)
+        place = (primitive.world_from_local @ np.append(origin, 1.0))[:3]
+        to_world = transform(_affine(rotation @ turn, place))
+        group = {"type": "ref", "id": groups[placement.id]}
+        nodes.append({"type": "instance", "shapegroup": group, "to_world": to_world})
+    return nodes
 
 
 def _is_uniform(primitive: ts.Cylinder) -> bool:

@@ -142,13 +142,15 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     config.attribute("oiio:UnassociatedAlpha", 1)
     image = OpenImageIO.ImageInput.open(str(texture.file), config)
     if image is None:
-        reason = OpenImageIO.geterror().strip()
+        reason = " ".join(OpenImageIO.geterror().split())
         raise InputError(f"{texture.file}: expected an image for a texture ({reason}); check the file")
     pixels = image.read_image("float" if hdr else "uint8")
     error = image.geterror()
     image.close()
     if pixels is None or error:
-        raise InputError(f"{texture.file}: the image is damaged ({error.strip()}); replace the file")
+        raise InputError(
+            f"{texture.file}: the image is damaged ({' '.join(error.split())}); replace the file"
+        )
     pixels = np.asarray(pixels)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     channels = pixels.shape[2]

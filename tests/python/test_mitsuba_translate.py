@@ -1,0 +1,501 @@
+"""The translator: all that it supports renders as Tungsten's formulas say, and the rest is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+mitsuba = pytest.importorskip("mitsuba", reason="the embedded host needs the package mitsuba")
+
+import OpenImageIO  # noqa: E402
+
+from tungsten_dip.errors import InputError  # noqa: E402
+from tungsten_dip.hosts.mitsuba.render import render_translated  # noqa: E402
+from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant  # noqa: E402
+from tungsten_dip.hosts.mitsuba.translate import translate  # noqa: E402
+from tungsten_dip.scene.parse import load_scene  # noqa: E402
+
+Json = dict[str, Any]
+
+WHITE_SKY = {"type": "infinite_sphere", "emission": 1.0}
+WHITE = {"type": "lambert", "albedo": 1.0}
+GREY = {"type": "lambert", "albedo": 0.5}
+FLOOR = {"type": "quad", "transform": {"scale": [8, 1, 8]}, "bsdf": GREY}
+LAMP = {
+    "type": "quad",
+    "transform": {"position": [0, 3, 0], "rotation": [0, 0, 180]},
+    "emission": 5.0,
+    "bsdf": {"type": "null"},
+}
+
+
+def ball(bsdf: Json | None = None, **fields: Any) -> Json:
+    return {
+        "type": "sphere",
+        "transform": {"position": [0, 0.8, 0], "scale": 0.8},
+        "bsdf": bsdf or GREY,
+        **fields,
+    }
+
+
+def render(
+    folder: Path,
+    primitives: list[Json],
+    camera: Json | None = None,
+    media: list[Json] | None = None,
+    spp: int = 4,
+    resolution: tuple[int, int] = (16, 12),
+    **sections: Any,
+) -> Any:
+    """Write the scene, translate it and return its buffers."""
+    scene = {
+        "primitives": primitives,
+        "media": media or [],
+        "camera": {
+            "type": "pinhole",
+            "fov": 45,
+            "resolution": list(resolution),
+            "reconstruction_filter": "box",
+            "transform": {"position": [0, 1.2, 4.5], "look_at": [0, 0.7, 0], "up": [0, 1, 0]},
+            **(camera or {}),
+        },
+        **sections,
+    }
+    path = folder / "scene.json"
+    path.write_text(json.dumps(scene))
+    with mitsuba_variant():
+        return render_translated(translate(load_scene(path)), spp, threads=1)
+
+
+def write_image(path: Path, pixels: np.ndarray) -> None:
+    height, width, channels = pixels.shape
+    image = OpenImageIO.ImageOutput.create(str(path))
+    kind = "uint8" if pixels.dtype == np.uint8 else "float"
+    assert image.open(str(path), OpenImageIO.ImageSpec(width, height, channels, kind))
+    assert image.write_image(np.ascontiguousarray(pixels))
+    image.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    write_image(tmp_path / "colour.png", rng.integers(0, 256, (3, 5, 3), dtype=np.uint8))
+    write_image(tmp_path / "alpha.png", rng.integers(0, 256, (3, 5, 4), dtype=np.uint8))
+    write_image(tmp_path / "sky.hdr", rng.random((5, 8, 3)).astype(np.float32))
+    (tmp_path / "mesh.obj").write_text("v -1 0 0\nv 1 0 0\nv 1 1 0\nv -1 1 0.3\nf 1 2 3\nf 1 3 4\n")
+    return tmp_path
+
+
+BSDFS: dict[str, Json] = {
+    "lambert": {"type": "lambert", "albedo": "colour.png"},
+    "oren_nayar": {"type": "oren_nayar", "albedo": 0.8, "roughness": 0.7},
+    "phong": {"type": "phong", "albedo": 0.8, "exponent": 32, "diffuse_ratio": 0.3},
+    "mirror": {"type": "mirror", "albedo": [0.9, 0.8, 0.7]},
+    "conductor": {"type": "conductor", "material": "Au"},
+    "rough_conductor": {"type": "rough_conductor", "material": "AlSb", "roughness": 0.2},
+    "rough_conductor, beckmann, texture": {
+        "type": "rough_conductor",
+        "eta": [1, 1, 1],
+        "k": [2, 2, 2],
+        "distribution": "beckmann",
+        "roughness": "colour.png",
+    },
+    "dielectric": {"type": "dielectric", "ior": 1.5},
+    "dielectric without refraction": {"type": "dielectric", "enable_refraction": False},
+    "rough_dielectric": {"type": "rough_dielectric", "roughness": 0.2, "albedo": [0.9, 0.5, 0.9]},
+    "rough_dielectric without refraction": {
+        "type": "rough_dielectric",
+        "distribution": "phong",
+        "enable_refraction": False,
+    },
+    "plastic": {"type": "plastic", "albedo": 0.5, "sigma_a": [0.1, 0.2, 0.3]},
+    "rough_plastic": {
+        "type": "rough_plastic",
+        "albedo": 0.5,
+        "roughness": "colour.png",
+        "distribution": "phong",
+    },
+    "smooth_coat": {"type": "smooth_coat", "sigma_a": 0.1},
+    "smooth_coat over metal": {"type": "smooth_coat", "substrate": {"type": "conductor", "material": "Ag"}},
+    "rough_coat": {"type": "rough_coat", "roughness": 0.1, "substrate": GREY},
+    "thinsheet": {"type": "thinsheet", "sigma_a": 0.5},
+    "thinsheet with interference": {"type": "thinsheet", "enable_interference": True, "thickness": 0.6},
+    "diffuse_transmission": {"type": "diffuse_transmission", "albedo": 0.8},
+    "transparency": {"type": "transparency", "alpha": "alpha.png", "base": GREY},
+    "mixed": {"type": "mixed", "ratio": "colour.png", "bsdf0": GREY, "bsdf1": {"type": "rough_conductor"}},
+    "null": {"type": "null"},
+    "forward": {"type": "forward"},
+}
+
+TURNED = {"position": [0, 0.8, 0], "rotation": [30, 40, 20], "scale": [0.9, 0.5, 0.7]}
+PRIMITIVES: dict[str, list[Json]] = {
+    "quad": [{"type": "quad", "transform": TURNED, "bsdf": {"type": "lambert", "albedo": "colour.png"}}],
+    "cube": [{"type": "cube", "transform": TURNED, "bsdf": GREY, "power": 3.0}],
+    "sphere": [ball()],
+    "disk": [{"type": "disk", "transform": TURNED, "bsdf": GREY, "emission": "colour.png"}],
+    "cylinder": [{"type": "cylinder", "transform": TURNED, "bsdf": GREY, "emission": 1.0}],
+    "open cylinder": [
+        {
+            "type": "cylinder",
+            "capped": False,
+            "transform": TURNED,
+            "bsdf": {"type": "lambert", "albedo": "colour.png"},
+        }
+    ],
+    "mesh": [{"type": "mesh", "file": "mesh.obj", "bsdf": [GREY, WHITE], "emission": 0.5}],
+    "smooth mesh": [
+        {"type": "mesh", "file": "mesh.obj", "smooth": True, "recompute_normals": True, "bsdf": GREY}
+    ],
+    "point": [{"type": "point", "transform": {"position": [1, 2, 1]}, "power": 9.0}],
+    "infinite_sphere": [{"type": "infinite_sphere", "emission": "sky.hdr"}],
+    "infinite_sphere_cap": [{"type": "infinite_sphere_cap", "power": 3.0, "cap_angle": 5}],
+    "instances": [
+        {
+            "type": "instances",
+            "masters": [{"type": "quad", "bsdf": GREY}],
+            "instances": [{"id": 0, "transform": {"position": [1, 1, 0]}}],
+        }
+    ],
+}
+
+TEXTURES: dict[str, Json] = {
+    "checker": {"type": "checker", "res_u": 3, "res_v": 2},
+    "disk": {"type": "disk", "value": 0.8},
+    "blade": {"type": "blade", "blades": 5, "value": [0.8, 0.6, 0.4]},
+    "constant": {"type": "constant", "value": 0.3},
+    "bitmap": {
+        "type": "bitmap",
+        "file": "colour.png",
+        "interpolate": False,
+        "clamp": True,
+        "gamma_correct": False,
+    },
+}
+
+
+@pytest.mark.parametrize("bsdf", BSDFS.values(), ids=BSDFS.keys())
+def test_every_bsdf_renders(folder: Path, bsdf: Json) -> None:
+    buffers = render(folder, [FLOOR, LAMP, ball(bsdf), WHITE_SKY])
+    for _, buffer in buffers.quantities():
+        assert np.isfinite(buffer.mean).all()
+    assert buffers.color.mean.max() > 0.1
+
+
+@pytest.mark.parametrize("primitives", PRIMITIVES.values(), ids=PRIMITIVES.keys())
+def test_every_primitive_renders(folder: Path, primitives: list[Json]) -> None:
+    buffers = render(folder, [FLOOR, *primitives])
+    for _, buffer in buffers.quantities():
+        assert np.isfinite(buffer.mean).all()
+    assert buffers.color.mean.max() > 0.0
+
+
+@pytest.mark.parametrize("texture", TEXTURES.values(), ids=TEXTURES.keys())
+@pytest.mark.parametrize("shape", ["quad", "disk", "sphere"])
+def test_every_texture_renders(folder: Path, texture: Json, shape: str) -> None:
+    surface = {"type": shape, "transform": {"scale": 2}, "bsdf": {"type": "lambert", "albedo": texture}}
+    buffers = render(folder, [surface, WHITE_SKY])
+    assert np.isfinite(buffers.albedo.mean).all()
+    assert buffers.albedo.mean.max() > 0.1
+
+
+# --- Analytic oracles -------------------------------------------------------------------------------
+
+CONSERVING: dict[str, Json] = {
+    "lambert": WHITE,
+    "mirror": {"type": "mirror"},
+    "dielectric": {"type": "dielectric", "ior": 1.4},
+    "plastic": {"type": "plastic", "albedo": 1.0, "ior": 1.6},
+    "thinsheet": {"type": "thinsheet"},
+    "forward": {"type": "forward"},
+    "transparency": {"type": "transparency", "alpha": 0.3, "base": WHITE},
+    "mixed": {
+        "type": "mixed",
+        "ratio": 0.3,
+        "bsdf0": WHITE,
+        "bsdf1": {"type": "phong", "exponent": 0, "diffuse_ratio": 1},
+    },
+    "coat": {"type": "smooth_coat", "ior": 1.0, "substrate": WHITE},
+}
+
+
+@pytest.mark.parametrize("bsdf", CONSERVING.values(), ids=CONSERVING.keys())
+def test_white_furnace(folder: Path, bsdf: Json) -> None:
+    closeup = {"transform": {"position": [0, 0.8, 3], "look_at": [0, 0.8, 0]}, "fov": 25}
+    buffers = render(folder, [ball(bsdf), WHITE_SKY], closeup, spp=64)
+    np.testing.assert_allclose(buffers.color.mean.mean(axis=(0, 1)), 1.0, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    "name", ["phong", "rough_conductor", "rough_dielectric", "rough_plastic", "rough_coat", "oren_nayar"]
+)
+def test_no_bsdf_makes_light(folder: Path, name: str) -> None:
+    bsdf = {**BSDFS[name], "albedo": 1.0}
+    buffers = render(folder, [ball(bsdf), WHITE_SKY], {"fov": 15}, spp=64)
+    assert (buffers.color.mean.mean(axis=(0, 1)) < 1.02).all()
+
+
+DOWN = {"transform": {"position": [2, 2, 0], "look_at": [0, 0, 0]}, "fov": 1}
+LIT = [
+    # Irradiance over pi at the origin of a floor, for radiance or power 2.
+    pytest.param(
+        {
+            "type": "disk",
+            "transform": {"position": [0, 1.5, 0], "scale": 0.5, "rotation": [180, 0, 0]},
+            "emission": 2,
+        },
+        2 * 0.25 / (0.25 + 2.25),
+        id="disk",
+    ),
+    pytest.param(
+        {
+            "type": "disk",
+            "transform": {"position": [0, 1.5, 0], "scale": 0.5, "rotation": [180, 0, 0]},
+            "power": 2,
+        },
+        2 / (math.pi**2 * 0.25) * 0.25 / (0.25 + 2.25),
+        id="disk power",
+    ),
+    pytest.param(
+        {"type": "sphere", "transform": {"position": [0, 1.5, 0], "scale": 0.5}, "emission": 2},
+        2 * (0.5 / 1.5) ** 2,
+        id="sphere",
+    ),
+    pytest.param(
+        {"type": "sphere", "transform": {"position": [0, 1.5, 0], "scale": 0.5}, "power": 2},
+        2 / (4 * math.pi**2 * 0.25) * (0.5 / 1.5) ** 2,
+        id="sphere power",
+    ),
+    pytest.param(
+        {"type": "point", "transform": {"position": [0, 1.5, 0]}, "emission": 2},
+        2 / 1.5**2 / math.pi,
+        id="point",
+    ),
+    pytest.param(
+        {"type": "point", "transform": {"position": [0, 1.5, 0]}, "power": 2},
+        2 / (4 * math.pi) / 1.5**2 / math.pi,
+        id="point power",
+    ),
+    pytest.param({"type": "infinite_sphere", "emission": 2}, 2.0, id="sky"),
+    pytest.param({"type": "infinite_sphere", "power": 2}, 2 / (4 * math.pi), id="sky power"),
+    pytest.param(
+        {"type": "infinite_sphere_cap", "cap_angle": 30, "emission": 2},
+        2 * math.sin(math.radians(30)) ** 2,
+        id="cap",
+    ),
+    pytest.param(
+        {"type": "infinite_sphere_cap", "cap_angle": 30, "power": 2},
+        2 / (2 * math.pi * (1 - math.cos(math.radians(30)))) * 0.25,
+        id="cap power",
+    ),
+    pytest.param(
+        {
+            "type": "quad",
+            "transform": {"position": [0, 3, 0], "scale": [1e-2, 1, 1e-2], "rotation": [0, 0, 180]},
+            "power": 2,
+        },
+        2 / math.pi / 9 / math.pi,
+        id="small quad power",
+    ),
+    pytest.param(
+        {"type": "quad", "transform": {"position": [0, 3, 0]}, "emission": 2}, 0.0, id="back of a quad"
+    ),
+]
+
+
+@pytest.mark.parametrize(("light", "irradiance_over_pi"), LIT)
+def test_irradiance(folder: Path, light: Json, irradiance_over_pi: float) -> None:
+    if light["type"] in ("disk", "sphere", "quad"):
+        light = {**light, "bsdf": {"type": "null"}}
+    buffers = render(folder, [FLOOR, light], DOWN, spp=64)
+    expected = 0.5 * irradiance_over_pi
+    np.testing.assert_allclose(buffers.color.mean.mean(), expected, rtol=0.02, atol=1e-7)
+
+
+def test_without_lights_the_sky_is_white(folder: Path) -> None:
+    buffers = render(folder, [{**ball(WHITE), "emission": 0.0}], {"fov": 15})
+    np.testing.assert_allclose(buffers.color.mean.mean(), 1.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "thinlens"])
+def test_a_point_projects_where_tungsten_puts_it(folder: Path, kind: str) -> None:
+    position, target = np.array([1.0, 2.0, 3.0]), np.array([0.2, 0.5, -1.0])
+    up = np.array([0.3, 1.0, -0.2])
+    point = np.array([0.9, 0.7, 0.4])
+    width, height, fov = 60, 44, 50.0
+    camera = {
+        "type": kind,
+        "fov": fov,
+        "aperture_size": 1e-4,
+        "transform": {"position": position.tolist(), "look_at": target.tolist(), "up": up.tolist()},
+    }
+    light = {
+        "type": "sphere",
+        "transform": {"position": point.tolist(), "scale": 0.1},
+        "emission": 1.0,
+        "bsdf": {"type": "null"},
+    }
+    color = render(folder, [light], camera, spp=16, resolution=(width, height)).color.mean[:, :, 0]
+
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    local = np.array([right, np.cross(right, forward), forward]) @ (point - position)
+    per_pixel = math.tan(math.radians(fov / 2)) * 2.0 / width
+    expected = np.array([width / 2, height / 2]) + local[:2] * [1, -1] / local[2] / per_pixel
+    if kind == "thinlens":
+        expected = expected + 0.5  # its pixels are sampled about their upper left corner
+    y, x = np.mgrid[:height, :width] + 0.5
+    found = np.array([(x * color).sum(), (y * color).sum()]) / color.sum()
+    np.testing.assert_allclose(found, expected, atol=0.15)
+
+
+def test_the_environment_is_where_tungsten_puts_it(folder: Path) -> None:
+    height, width, row, column = 8, 16, 2, 5
+    pixels = np.zeros((height, width, 3), np.float32)
+    pixels[row, column] = [3.0, 2.0, 1.0]
+    write_image(folder / "spot.pfm", pixels)
+    phi = ((column + 0.5) / width - 0.5) * 2 * math.pi
+    theta = (1 - (row + 0.5) / height) * math.pi
+    direction = [math.cos(phi) * math.sin(theta), -math.cos(theta), math.sin(phi) * math.sin(theta)]
+    camera = {"fov": 0.1, "transform": {"position": [0, 0, 0], "look_at": direction}}
+    sky = {"type": "infinite_sphere", "emission": {"type": "bitmap", "file": "spot.pfm", "scale": 2}}
+    buffers = render(folder, [sky], camera)
+    np.testing.assert_allclose(buffers.color.mean.mean(axis=(0, 1)), [6.0, 4.0, 2.0], rtol=0.01)
+
+
+def test_a_bitmap_lies_where_tungsten_puts_it(folder: Path) -> None:
+    pixels = np.zeros((2, 2, 3), np.uint8)
+    pixels[0, 1] = [255, 128, 20]
+    write_image(folder / "corner.png", pixels)
+    texture = {"type": "bitmap", "file": "corner.png", "interpolate": False}
+    # From above with +z up in the picture u grows to the left and v upwards; row 0 of the image is at v = 1.
+    camera = {"transform": {"position": [0, 2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1]}, "fov": 20}
+    albedo = render(
+        folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": texture}}], camera, resolution=(4, 4)
+    ).albedo.mean
+    expected = np.zeros((4, 4, 3))
+    expected[:2, :2] = np.floor(255 * (np.array([255, 128, 20]) / 255) ** 2.2) / 255
+    np.testing.assert_allclose(albedo, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_an_absorbing_medium_dims_by_beer_and_lambert(folder: Path, shape: str) -> None:
+    gas = {"name": "gas", "type": "homogeneous", "sigma_a": [0.2, 0.5, 1.0], "density": 2.0}
+    boundary = {"type": shape, "bsdf": {"type": "forward"}, "int_medium": "gas"}
+    camera = {"transform": {"position": [0, 0, 5], "look_at": [0, 0, 0]}, "fov": 0.5}
+    buffers = render(folder, [boundary, WHITE_SKY], camera, [gas], spp=256)
+    thickness = 1.0 if shape == "cube" else 2.0
+    expected = np.exp(-np.array([0.4, 1.0, 2.0]) * thickness)
+    np.testing.assert_allclose(buffers.color.mean.mean(axis=(0, 1)), expected, rtol=0.02)
+
+
+def test_two_sided_shading_can_be_switched_off(folder: Path) -> None:
+    back = [{"type": "quad", "transform": {"rotation": [0, 0, 180]}, "bsdf": GREY}, WHITE_SKY]
+    above = {"transform": {"position": [0, 2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1]}, "fov": 10}
+    lit = render(folder, back, above, spp=64).color.mean
+    black = render(
+        folder, back, above, integrator={"type": "path_tracer", "enable_two_sided_shading": False}
+    ).color.mean
+    np.testing.assert_allclose(lit.mean(), 0.5, rtol=0.02)
+    np.testing.assert_allclose(black, 0.0)
+
+
+def test_shared_objects_are_made_once(folder: Path) -> None:
+    scene = {
+        "bsdfs": [{"name": "grey", **GREY}],
+        "primitives": [{"type": "quad", "bsdf": "grey"}, {"type": "cube", "bsdf": "grey"}, WHITE_SKY],
+        "camera": {"type": "pinhole", "resolution": [4, 4]},
+    }
+    path = folder / "scene.json"
+    path.write_text(json.dumps(scene))
+    with mitsuba_variant():
+        translated = translate(load_scene(path))
+    assert list(translated.albedo) == [name for name in translated.scene if name.startswith("bsdf")]
+    assert len(translated.albedo) == 1
+
+
+# --- Refusals ---------------------------------------------------------------------------------------
+
+
+def surface(bsdf: Json, **fields: Any) -> Json:
+    return {"primitives": [{"name": "thing", "type": "quad", "bsdf": bsdf, **fields}]}
+
+
+def with_camera(**fields: Any) -> Json:
+    return {"primitives": [FLOOR], "camera": {"resolution": [8, 8], **fields}}
+
+
+def with_medium(**fields: Any) -> Json:
+    gas = {"name": "gas", "type": "homogeneous", "sigma_s": 1.0, **fields}
+    return {
+        "media": [gas],
+        "primitives": [{"type": "cube", "bsdf": {"type": "forward"}, "int_medium": "gas"}],
+    }
+
+
+REFUSED: dict[str, Json] = {
+    "lambertian_fiber": surface({"type": "lambertian_fiber"}),
+    "rough_wire": surface({"type": "rough_wire"}),
+    "distribution phong": surface({"type": "rough_conductor", "distribution": "phong"}),
+    "coloured rough_dielectric": surface(
+        {"type": "rough_dielectric", "albedo": 0.5, "enable_refraction": False}
+    ),
+    "bump mapping": surface({**GREY, "bump": {"type": "checker"}}),
+    "texture of type ies": surface({"type": "lambert", "albedo": {"type": "ies", "file": "colour.png"}}),
+    "smooth_coat over a BSDF that transmits": surface(
+        {"type": "smooth_coat", "substrate": {"type": "dielectric"}}
+    ),
+    "specular part": surface({"type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY}),
+    "albedo of its own": surface({"type": "mixed", "albedo": 0.5, "bsdf0": WHITE, "bsdf1": GREY}),
+    "sheared quad": surface(GREY, transform=[1, 0, 0.5, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
+    "cone_angle": {"primitives": [{"type": "disk", "emission": 1.0, "cone_angle": 30}]},
+    "cylinder without caps": {"primitives": [{"type": "cylinder", "emission": 1.0, "capped": False}]},
+    "texture on a cylinder": {
+        "primitives": [{"type": "cylinder", "bsdf": {"type": "lambert", "albedo": "colour.png"}}]
+    },
+    "shining sphere with a texture": {"primitives": [ball(emission="colour.png")]},
+    "point light with a texture": {"primitives": [{"type": "point", "emission": "colour.png"}]},
+    "infinite_sphere with a texture": {
+        "primitives": [{"type": "infinite_sphere", "emission": {"type": "checker"}}]
+    },
+    "more than one light": {"primitives": [WHITE_SKY, WHITE_SKY]},
+    "file of instances": {"primitives": [{"type": "instances", "masters": [FLOOR], "instances": "many.bin"}]},
+    "cubemap": with_camera(type="cubemap"),
+    "equirectangular": with_camera(type="equirectangular"),
+    "cateye": with_camera(type="thinlens", cateye=0.5),
+    "aperture of type blade": with_camera(type="thinlens", aperture={"type": "blade"}),
+    "scale in its transform": with_camera(type="pinhole", transform={"scale": 2}),
+    "medium of type exponential": with_medium(type="exponential"),
+    "medium of type atmosphere": with_medium(type="atmosphere"),
+    "transmittance of type linear": with_medium(transmittance={"type": "linear"}),
+    "fewer bounces": with_medium(max_bounces=3),
+    "integrator of type bidirectional": {
+        "primitives": [FLOOR],
+        "integrator": {"type": "bidirectional_path_tracer"},
+    },
+}
+
+
+@pytest.mark.parametrize(("construct", "scene"), REFUSED.items(), ids=REFUSED.keys())
+def test_what_has_no_counterpart_is_refused(folder: Path, construct: str, scene: Json) -> None:
+    path = folder / "scene.json"
+    (folder / "many.bin").write_bytes(b"")
+    path.write_text(json.dumps({"camera": {"type": "pinhole", "resolution": [8, 8]}, **scene}))
+    with mitsuba_variant(), pytest.raises(InputError) as error:
+        translate(load_scene(path))
+    message = str(error.value)
+    assert construct in message
+    assert "--host tungsten" in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+def test_a_broken_image_is_one_line_that_names_it(folder: Path) -> None:
+    (folder / "broken.png").write_bytes((folder / "colour.png").read_bytes()[:40])
+    with pytest.raises(InputError, match=r"broken\.png") as error:
+        render(folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": "broken.png"}}])
+    assert "\n" not in str(error.value)
