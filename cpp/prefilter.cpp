@@ -175,7 +175,7 @@ class TileFilter {
         }
     }
 
-    // The distances of a row's pixels to their partners, after Rousselle et al. 2012, equation 4: squared
+    // The distances of a row's pixels to their partners, after Rousselle et al. 2012: squared
     // differences less what noise alone makes of them, over the variance, averaged over channels.
     void measure_row(int y, int dy, int dx, Range columns) {
         distances_ = {};
