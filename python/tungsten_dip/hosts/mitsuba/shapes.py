@@ -90,7 +90,9 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     mesh = mesh_geometry(primitive)
     matrix = primitive.world_from_local
     positions = mesh.positions @ matrix[:3, :3].T + matrix[:3, 3]
-    normals = mesh.normals @ np.linalg.inv(matrix[:3, :3]) if primitive.smooth else None
+    # The inverse scale comes last in Tungsten, which bends normals under a rotation with an uneven scale.
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    normals = mesh.normals @ matrix[:3, :3].T / lengths**2 if primitive.smooth else None
     corners = positions[mesh.triangles]
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = float(0.5 * np.linalg.norm(np.cross(*edges), axis=1).sum())
