@@ -1,4 +1,5 @@
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -465,6 +466,16 @@ def test_an_internal_error_is_one_line_and_a_traceback_only_on_demand(folder, tm
     monkeypatch.setenv("TUNGSTEN_DIP_DEBUG", "1")
     with pytest.raises(RuntimeError, match="a bug"):
         command.main(arguments)
+
+
+def test_a_command_leaves_logging_and_stdout_as_they_were(folder, tmp_path, fits, capfd):
+    logger = logging.getLogger("tungsten_dip")
+    before = (list(logger.handlers), logger.level, logger.propagate)
+    assert command.main(["denoise", str(folder), "-o", str(tmp_path / "out.exr"), "--json"]) == 0
+    assert (list(logger.handlers), logger.level, logger.propagate) == before
+    capfd.readouterr()
+    os.write(1, b"still there")
+    assert capfd.readouterr().out == "still there"
 
 
 def test_a_missing_part_of_the_package_is_named(tmp_path, monkeypatch, capfd):

@@ -51,10 +51,10 @@ class Parser(argparse.ArgumentParser):
 
 def run(command: str, body: Callable[[], None]) -> int:
     """Run a command's body and return its exit status; whatever goes wrong becomes one line on stderr."""
-    _log_to_stderr(command)
     debug = bool(os.environ.get(DEBUG_VARIABLE))
     try:
-        body()
+        with _log_on_stderr(command):
+            body()
         sys.stdout.flush()
     except KeyboardInterrupt:
         return _fail(command, "interrupted", EXIT_INTERRUPTED)
@@ -160,12 +160,8 @@ def remarks_from_log() -> Iterator[list[str]]:
     remarks: list[str] = []
     handler = logging.Handler(logging.INFO)
     handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
-    logger = logging.getLogger("tungsten_dip")
-    logger.addHandler(handler)
-    try:
+    with _logging_to(handler):
         yield remarks
-    finally:
-        logger.removeHandler(handler)
 
 
 class _StderrHandler(logging.Handler):
@@ -175,15 +171,26 @@ class _StderrHandler(logging.Handler):
         tqdm.write(self.format(record), file=sys.stderr)
 
 
-def _log_to_stderr(command: str) -> None:
-    logger = logging.getLogger("tungsten_dip")
-    logger.setLevel(logging.INFO)
-    logger.propagate = False
-    for handler in list(logger.handlers):
-        logger.removeHandler(handler)
+@contextmanager
+def _log_on_stderr(command: str) -> Iterator[None]:
     handler = _StderrHandler()
     handler.setFormatter(logging.Formatter(f"{command}: %(message)s"))
+    with _logging_to(handler):
+        yield
+
+
+@contextmanager
+def _logging_to(handler: logging.Handler) -> Iterator[None]:
+    """Hand what the library logs at INFO and above to the handler, within the block alone."""
+    logger = logging.getLogger("tungsten_dip")
+    level = logger.level
+    logger.setLevel(logging.INFO)
     logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _message(error: Exception) -> str:
