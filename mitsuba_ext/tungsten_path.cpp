@@ -455,19 +455,22 @@ class TungstenPath final : public Variant::Integrator {
         const Scattering next = scatter(bsdf, hit, random);
         const Vector3 direction = hit.to_world(next.local_direction);
         bool goes_on = next.kind != Scattering::none;
+        // Even where the path goes straight on: the value of a partly transparent BSDF includes how rarely it
+        // does not.
+        const bool samples_lights =
+            light_sampling_ && (path.medium_bounces > 0 || include_surfaces_) && has_smooth_lobe;
         std::optional<float> light_visibility;
+        if (samples_lights && path.bounce < max_bounces_ - 1)
+            light_visibility = light_from_surface(scene, bsdf, random, path);
         if (next.kind != Scattering::forward) {
             goes_on = goes_on && is_consistent(hit, direction, next.local_direction);
             if (emitter != nullptr && path.bounce >= min_bounces_)
                 path.radiance += path.throughput * emitted(scene, hit, *emitter, path);
-            path.samples_lights =
-                light_sampling_ && (path.medium_bounces > 0 || include_surfaces_) && has_smooth_lobe;
-            if (path.samples_lights && path.bounce < max_bounces_ - 1)
-                light_visibility = light_from_surface(scene, bsdf, random, path);
             if (goes_on) {
                 path.was_specular = next.kind == Scattering::specular;
                 path.vertex = hit;
                 path.direction_pdf = next.pdf;
+                path.samples_lights = samples_lights;
             }
         }
         if (path.medium_bounces == 0 && !include_surfaces_ && has_smooth_lobe) return false;

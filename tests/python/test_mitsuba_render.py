@@ -175,6 +175,13 @@ def test_features_behind_transparency(bsdf: dict[str, Any]) -> None:
     np.testing.assert_allclose(buffers.depth.mean[..., 0], -CAMERA_Z / directions((12, 9))[..., 2], rtol=1e-5)
 
 
+def test_half_transparent_ball_is_a_furnace() -> None:
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": diffuse(1.0)}
+    color = render_translated(scene(placed("sphere", "veil"), bsdfs={"veil": (veil, 1.0)}), spp=64).color
+    assert is_near(color.mean, 1.0, color.variance)
+    assert color.variance.max() > 0
+
+
 def test_emission_is_added_to_albedo_on_the_side_that_shines() -> None:
     lamp = {"type": "area", "radiance": gray(3.0)}
     for turn, expected in ((1.0, 0.5 + 3.0), (-1.0, 0.5)):
