@@ -18,36 +18,17 @@ log = logging.getLogger(__name__)
 FIT_OPTIONS = ("preset", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
 
+REPORT_HELP = "write a page with the pictures, the error and what led to them"
+
 
 def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
     """Add the options of a fit that both commands have, as ``--{prefix}preset`` and so on."""
-    add = parser.add_argument
-    add(
-        f"--{prefix}preset",
-        dest="preset",
-        choices=get_args(Preset),
-        help="how long to fit (default: balanced)",
-    )
-    add(
-        f"--{prefix}time-budget",
-        dest="time_budget_s",
-        metavar="S",
-        type=duration,
-        help="stop the fit after this time (90s, 5m)",
-    )
-    add(
-        f"--{prefix}target-error",
-        dest="target_error",
-        metavar="E",
-        type=float,
-        help="stop the fit when the estimated relMSE is this small",
-    )
-    add(
-        f"--{prefix}device",
-        dest="device",
-        choices=get_args(get_type_hints(FitSettings)["device"]),
-        help="where to fit (default: auto)",
-    )
+    add, flag = parser.add_argument, f"--{prefix}"
+    devices = get_args(get_type_hints(FitSettings)["device"])
+    add(f"{flag}preset", dest="preset", choices=get_args(Preset), help="how to fit (default: balanced)")
+    add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=duration, help="end after 90s, 5m, ...")
+    add(f"{flag}target-error", dest="target_error", metavar="E", type=float, help="end at this relMSE")
+    add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")
 
 
 def fit_settings(options: argparse.Namespace, names: Sequence[str]) -> FitSettings:

@@ -13,6 +13,7 @@ from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_
 from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, remarks_from_log, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
+    REPORT_HELP,
     add_fit_options,
     denoise_with_progress,
     fit_settings,
@@ -64,7 +65,8 @@ def denoise_outputs(
 
 def _run(arguments: Sequence[str] | None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    parser, options = _parser(), _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
     if not options.scenes:
         parser.print_help()
         return
@@ -88,7 +90,7 @@ def _run(arguments: Sequence[str] | None) -> None:
     if host == "tungsten" and not tungsten_host.in_process():
         tungsten_host.run_native(arguments)
 
-    settings = fit_settings(options, FIT_OPTIONS)
+    settings = fit_settings(options, (*FIT_OPTIONS, "threads"))
     failed = 0
     for path in options.scenes:
         try:
@@ -105,58 +107,24 @@ def _run(arguments: Sequence[str] | None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="tungsten", description="Render scenes in Tungsten's format, and denoise them.")
     add = parser.add_argument
-    add(
-        "-v",
-        "--version",
-        action="version",
-        version=f"tungsten, version {tungsten_dip.__version__} (tungsten-dip)",
-    )
     add("scenes", metavar="scene", type=Path, nargs="*", help="scene files (JSON)")
-    add("-t", "--threads", metavar="N", type=int, help="number of threads (default: one per core)")
+    add("-v", "--version", action="version", version=f"tungsten, version {tungsten_dip.__version__}")
+    add("-t", "--threads", metavar="N", type=int, help="number of threads")
     add("-r", "--restart", action="store_true", help="ignore saved render checkpoints and start from 0 spp")
-    add(
-        "-c",
-        "--checkpoint",
-        metavar="S",
-        type=minutes,
-        help="render time before a checkpoint is saved; 0: none",
-    )
-    add(
-        "-i",
-        "--input-directory",
-        metavar="DIR",
-        type=Path,
-        help="where the scenes' files are (default: beside them)",
-    )
-    add(
-        "-d",
-        "--output-directory",
-        metavar="DIR",
-        type=Path,
-        help="where output goes, made if it does not exist",
-    )
+    add("-c", "--checkpoint", metavar="S", type=minutes, help="render time between checkpoints; 0: none")
+    add("-i", "--input-directory", metavar="DIR", type=Path, help="where the files of the scenes are")
+    add("-d", "--output-directory", metavar="DIR", type=Path, help="where output goes; made if need be")
     add("--spp", metavar="N", type=int, help="samples per pixel in place of the scene's")
-    add(
-        "--timeout",
-        metavar="S",
-        type=minutes,
-        help="maximum render time (minutes, or 90s, 1.5h); 0: unlimited",
-    )
-    add("-s", "--seed", metavar="N", type=int, help="random seed")
+    add("--timeout", metavar="S", type=minutes, help="maximum render time in minutes, or 90s, 2h; 0: none")
+    add("-s", "--seed", metavar="N", type=int, help="random seed of the render")
     add("-o", "--output-file", metavar="FILE", type=Path, help="PNG in place of the scene's output_file")
-    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR or PFM in place of hdr_output_file")
-    add("--host", choices=("auto", "tungsten", "mitsuba"), default="auto",
-        help="who renders (default: Tungsten where it was built in, else Mitsuba)")  # fmt: skip
+    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR or PFM in place of the scene's")
+    hosts = ("auto", "tungsten", "mitsuba")
+    add("--host", choices=hosts, default="auto", help="who renders (auto: Tungsten if it was built in)")
     dip = parser.add_argument_group("denoising")
     dip.add_argument("--dip-denoise", action="store_true", help="denoise the picture with a deep image prior")
     add_fit_options(dip, prefix="dip-")
-    dip.add_argument(
-        "--dip-report",
-        dest="report",
-        metavar="R.html",
-        type=Path,
-        help="write a page with pictures and error",
-    )
+    dip.add_argument("--dip-report", dest="report", metavar="R.html", type=Path, help=REPORT_HELP)
     return parser
 
 

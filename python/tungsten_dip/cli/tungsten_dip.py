@@ -22,6 +22,7 @@ from tungsten_dip.buffers import (
 from tungsten_dip.cli.console import Parser, json_on_stdout, remarks_from_log, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
+    REPORT_HELP,
     add_fit_options,
     denoise_with_progress,
     fit_settings,
@@ -31,6 +32,8 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
+
+MAP_HELP = "take this layer of the input for color, albedo, normal, depth, colorA, ..."
 
 TONEMAP = "gamma"
 """How saved buffers are displayed: Tungsten's default."""
@@ -78,14 +81,11 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--inputs", choices=get_args(Inputs), help="(default: all+random)")
     paper.add_argument("--scheme", choices=get_args(types["scheme"]), help="(default: iic)")
     paper.add_argument("--channels", metavar="8,16,...", type=_counts, help="(default: 8,16,32,64,128)")
-    files = denoise.add_argument_group("files")
-    files.add_argument("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[],
-                       help="take this layer for color, albedo, normal, depth, colorA, ...")  # fmt: skip
-    files.add_argument("--half", action="store_true", help="write 16-bit floats")
-    files.add_argument(
-        "--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel"
-    )
-    files.add_argument("--report", metavar="R.html", type=Path, help="write a page with pictures and error")
+    add = denoise.add_argument_group("files").add_argument
+    add("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[], help=MAP_HELP)
+    add("--half", action="store_true", help="write 16-bit floats")
+    add("--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel")
+    add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
 
     inspect = commands.add_parser("inspect", help="show what a scene calls for, or what a file holds")
     inspect.set_defaults(action=_inspect)
