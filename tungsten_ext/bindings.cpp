@@ -117,17 +117,6 @@ void bind(py::module_& module) {
                 return dict_from_evidence(evidence);
             },
             "Tungsten's own buffers as arrays, without a copy, as evidence() has them; ends the render.");
-
-    module.def(
-        "save_ldr",
-        [](const std::string& path, const FloatArray& radiance, const std::string& tonemap) {
-            if (radiance.ndim() != 3 || radiance.shape(2) != 3)
-                throw py::value_error("radiance: expected float32 of shape (height, width, 3)");
-            save_ldr(path, {radiance.data(), static_cast<std::size_t>(radiance.size())},
-                     static_cast<int>(radiance.shape(1)), static_cast<int>(radiance.shape(0)), tonemap);
-        },
-        py::arg("path"), py::arg("radiance").noconvert(), py::arg("tonemap"),
-        "Write linear radiance, tonemapped as Tungsten does it, as PNG or JPEG.");
 }
 
 }  // namespace tungsten_dip

@@ -1,32 +1,38 @@
 // The hook: Tungsten's scene, integrator and camera behind render.hpp.
 #include "render.hpp"
 
-#include <Version.hpp>
+#include <rapidjson/stringbuffer.h>
+#include <rapidjson/writer.h>
+#include <sys/mman.h>
+
 #include <algorithm>
-#include <cameras/Camera.hpp>
-#include <cameras/OutputBuffer.hpp>
-#include <cameras/Tonemap.hpp>
+#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <future>
-#include <integrators/path_tracer/PathTraceIntegrator.hpp>
-#include <io/DirectoryChange.hpp>
-#include <io/FileUtils.hpp>
-#include <io/ImageIO.hpp>
-#include <io/JsonDocument.hpp>
-#include <io/Scene.hpp>
-#include <io/StringUtils.hpp>
 #include <map>
 #include <mutex>
-#include <primitives/EmbreeUtil.hpp>
-#include <renderer/TraceableScene.hpp>
+#include <new>
 #include <sstream>
 #include <stdexcept>
 #include <streambuf>
-#include <thread/ThreadPool.hpp>
-#include <thread/ThreadUtils.hpp>
 #include <thread>
 #include <utility>
+
+#include "Version.hpp"
+#include "cameras/Camera.hpp"
+#include "cameras/OutputBuffer.hpp"
+#include "integrators/path_tracer/PathTraceIntegrator.hpp"
+#include "io/DirectoryChange.hpp"
+#include "io/FileUtils.hpp"
+#include "io/JsonDocument.hpp"
+#include "io/Scene.hpp"
+#include "io/StringUtils.hpp"
+#include "math/BitManip.hpp"
+#include "primitives/EmbreeUtil.hpp"
+#include "renderer/TraceableScene.hpp"
+#include "thread/ThreadPool.hpp"
+#include "thread/ThreadUtils.hpp"
 #ifdef OPENVDB_AVAILABLE
 #include <openvdb/openvdb.h>
 #endif
@@ -81,6 +87,13 @@ struct CameraBuffers : Camera {
     static constexpr auto visibility = &CameraBuffers::_visibilityBuffer;
 };
 
+// What Integrator::resumeRender needs of itself, for our own reading of what it saves.
+struct IntegratorState : Integrator {
+    static constexpr auto load = &IntegratorState::loadState;
+    static constexpr auto current_spp = &IntegratorState::_currentSpp;
+    static constexpr auto advance_spp = &IntegratorState::advanceSpp;
+};
+
 // Calls f(type, name, member) for every quantity, colour first.
 template <typename F>
 void for_each_quantity(F&& f) {
@@ -104,27 +117,46 @@ class BlockAddresses : public std::streambuf {
     }
 };
 
-template <typename T>
 struct BufferBlocks {
-    const T* half_a;
-    const T* half_b;
-    const T* squared_deviations;
+    const float* half_a;
+    const float* half_b;
+    const float* squared_deviations;
     const std::uint32_t* counts;
 };
 
 // Only for buffers with halves and variance, which is what Render asks for.
 template <typename T>
-BufferBlocks<T> blocks_of(const OutputBuffer<T>& buffer) {
+BufferBlocks blocks_of(const OutputBuffer<T>& buffer) {
     static_assert(sizeof(Vec3f) == 3 * sizeof(float));
     BlockAddresses addresses;
     OutputStreamHandle stream = std::make_shared<std::ostream>(&addresses);
     buffer.serialize(stream);
     if (addresses.blocks.size() != 4)
         throw std::runtime_error(
-            "expected an output buffer with halves and variance; this Tungsten serializes another");
-    const auto at = [&](std::size_t i) { return static_cast<const void*>(addresses.blocks[i]); };
-    return {static_cast<const T*>(at(0)), static_cast<const T*>(at(1)), static_cast<const T*>(at(2)),
-            static_cast<const std::uint32_t*>(at(3))};
+            "expected output buffers with halves and variance; this Tungsten keeps others");
+    const auto floats = [&](std::size_t i) { return reinterpret_cast<const float*>(addresses.blocks[i]); };
+    return {floats(0), floats(1), floats(2), reinterpret_cast<const std::uint32_t*>(addresses.blocks[3])};
+}
+
+// For all pixels in [begin, end): the mean of both halves, and, in place, the variance of that mean from the
+// summed squared deviations. Both as OutputBuffer has them, but in runs of equal sample counts, which the
+// compiler can vectorise. A pixel without samples gets 0 where OutputBuffer::save writes a variance of 0/0.
+void combine(const BufferBlocks& blocks, std::size_t channels, std::uint32_t begin, std::uint32_t end,
+             float* __restrict mean, float* __restrict variance) {
+    while (begin < end) {
+        const std::uint32_t count = blocks.counts[begin];
+        const std::uint32_t* run_end = std::find_if(blocks.counts + begin, blocks.counts + end,
+                                                    [=](std::uint32_t c) { return c != count; });
+        const auto stop = static_cast<std::uint32_t>(run_end - blocks.counts);
+        const float count_a = static_cast<float>((count + 1) / 2), count_b = static_cast<float>(count / 2);
+        const float n = static_cast<float>(std::max(count, 1u));
+        const float degrees = std::max(1.0f, n * (n - 1.0f));
+        for (std::size_t i = begin * channels; i < stop * channels; ++i) {
+            mean[i] = (blocks.half_a[i] * count_a + blocks.half_b[i] * count_b) / n;
+            variance[i] /= degrees;
+        }
+        begin = stop;
+    }
 }
 
 // Calls f(begin, end) for a share of the items on every core. Tungsten's own parallelFor looks for the end of
@@ -139,14 +171,33 @@ void parallel_ranges(std::uint32_t items, const F& f) {
 }
 
 // Owns what an Evidence points into: buffers moved out of the camera, and arrays of our own.
-struct EvidenceMemory {
-    std::vector<std::shared_ptr<void>> buffers;
-    std::vector<std::unique_ptr<float[]>> arrays;
-
+class EvidenceMemory {
+  public:
+    // Large pages: writing to 90 MB of new memory for the first time otherwise takes longer than all else.
     float* allocate(std::size_t floats) {
-        arrays.emplace_back(new float[floats]);
-        return arrays.back().get();
+        constexpr std::size_t large_page = std::size_t{2} << 20;
+        const std::size_t bytes = (floats * sizeof(float) + large_page - 1) / large_page * large_page;
+        void* memory = std::aligned_alloc(large_page, bytes);
+        if (!memory) throw std::bad_alloc();
+        arrays_.emplace_back(memory, std::free);
+        madvise(memory, bytes, MADV_HUGEPAGE);
+        return static_cast<float*>(memory);
     }
+
+    float* copy(const float* source, std::size_t floats) {
+        float* array = allocate(floats);
+        std::memcpy(array, source, floats * sizeof(float));
+        return array;
+    }
+
+    template <typename T>
+    void own(std::unique_ptr<OutputBuffer<T>> buffer) {
+        buffers_.emplace_back(std::move(buffer));
+    }
+
+  private:
+    std::vector<std::shared_ptr<void>> buffers_;
+    std::vector<std::unique_ptr<void, decltype(&std::free)>> arrays_;
 };
 
 bool has_complete_output(const RendererSettings& settings, int type) {
@@ -161,6 +212,18 @@ std::string resume_file_with_evidence(const std::string& path) {
     const auto dot = path.find_last_of("./\\");
     const bool has_extension = dot != std::string::npos && path[dot] == '.';
     return has_extension ? path.substr(0, dot) + "_dip" + path.substr(dot) : path + "_dip";
+}
+
+// Of everything but the renderer's settings, as a saved state carries it.
+uint64 scene_hash(const Scene& scene) {
+    rapidjson::Document document;
+    document.SetObject();
+    static_cast<rapidjson::Value&>(document) = scene.toJson(document.GetAllocator());
+    document.RemoveMember("renderer");
+    rapidjson::StringBuffer text;
+    rapidjson::Writer<rapidjson::StringBuffer> writer(text);
+    document.Accept(writer);
+    return BitManip::hash(text.GetString());
 }
 
 // The settings' own reader takes our additions as if they stood in the scene file. Fields that are not named
@@ -290,9 +353,31 @@ std::uint32_t Render::current_spp() const { return impl_->integrator().currentSp
 std::uint32_t Render::total_spp() const { return impl_->total_spp; }
 bool Render::done() const { return impl_->integrator().done(); }
 
+// Reads what Integrator::saveRenderResumeData wrote. Its counterpart resumeRender keeps a reference to a path
+// that no longer exists when it opens the file, so with many compilers it never resumes.
 bool Render::resume() {
-    const DirectoryChange context(impl_->input_directory);
-    return impl_->integrator().resumeRender(*impl_->scene);
+    Scene& scene = *impl_->scene;
+    Integrator& integrator = impl_->integrator();
+    const RendererSettings& settings = scene.rendererSettings();
+    const Path& file = settings.resumeRenderFile();
+    InputStreamHandle in = FileUtils::openInputStream(file);
+    if (!in) return false;
+
+    const JsonDocument document(file, FileUtils::streamRead<std::string>(in));
+    bool adaptive = false, stratified = false;
+    uint32 spp = 0;
+    if (!document.getField("adaptive_sampling", adaptive) || adaptive != settings.useAdaptiveSampling() ||
+        !document.getField("stratified_sampler", stratified) || stratified != settings.useSobol() ||
+        !document.getField("current_spp", spp))
+        return false;
+    if (FileUtils::streamRead<uint64>(in) != scene_hash(scene)) return false;
+
+    scene.camera()->deserializeOutputBuffers(in);
+    (integrator.*IntegratorState::load)(in);
+    if (!in->good()) throw std::runtime_error(file.absolute().asString() + " is cut short");
+    integrator.*IntegratorState::current_spp = spp;
+    (integrator.*IntegratorState::advance_spp)();
+    return true;
 }
 
 void Render::start_pass() {
@@ -331,16 +416,17 @@ template <typename T>
 void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBufferSettings& settings) const {
     const Vec2u size = scene->camera()->resolution();
     const std::size_t pixels = size.product();
-    const BufferBlocks<T> blocks = blocks_of(buffer);
+    const BufferBlocks blocks = blocks_of(buffer);
     auto serialized = std::make_shared<std::stringstream>();
     OutputStreamHandle out = serialized;
+    const std::size_t floats = pixels * sizeof(T) / sizeof(float);
     if (settings.twoBufferVariance()) {
-        FileUtils::streamWrite(out, blocks.half_a, pixels);
-        FileUtils::streamWrite(out, blocks.half_b, pixels);
+        FileUtils::streamWrite(out, blocks.half_a, floats);
+        FileUtils::streamWrite(out, blocks.half_b, floats);
     } else {
         for (std::uint32_t i = 0; i < pixels; ++i) FileUtils::streamWrite(out, buffer[i]);
     }
-    if (settings.sampleVariance()) FileUtils::streamWrite(out, blocks.squared_deviations, pixels);
+    if (settings.sampleVariance()) FileUtils::streamWrite(out, blocks.squared_deviations, floats);
     FileUtils::streamWrite(out, blocks.counts, pixels);
 
     const OutputBuffer<T> own(size, settings);
@@ -350,62 +436,55 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
 }
 
 Evidence Render::Impl::collect(EvidenceMemory& memory, bool take) const {
-    integrator();  // throws where the render is over
+    const float current_spp = static_cast<float>(integrator().currentSpp());
     Camera& camera = *scene->camera();
     const Vec2u size = camera.resolution();
     const std::uint32_t width = size.x(), pixels = size.product();
-    Evidence evidence{static_cast<int>(size.x()),
-                      static_cast<int>(size.y()),
-                      {},
-                      nullptr,
-                      static_cast<float>(traceable->integrator().currentSpp()),
-                      nullptr};
+    Evidence evidence{static_cast<int>(width), static_cast<int>(size.y()), {}, nullptr, current_spp, nullptr};
+
+    if (!plan.writes_features) {
+        // Light also arrives by splatting, which no half knows of: only the whole image is sound.
+        float* mean = memory.allocate(std::size_t{pixels} * 3);
+        parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
+            for (std::uint32_t i = begin; i < end; ++i) {
+                const Vec3f radiance =
+                    camera.getLinear(static_cast<int>(i % width), static_cast<int>(i / width));
+                std::copy_n(radiance.data(), 3, mean + std::size_t{i} * 3);
+            }
+        });
+        evidence.quantities.push_back(Quantity{"color", 3, mean, nullptr, nullptr, nullptr});
+        return evidence;
+    }
 
     for_each_quantity([&](OutputBufferTypeEnum type, const char* name, auto member) {
         auto& buffer = camera.*member;
-        if (!buffer || (type != OutputColor && !plan.writes_features)) return;
-        using T = std::decay_t<decltype((*buffer)[0])>;
-        constexpr int channels = sizeof(T) / sizeof(float);
-        const BufferBlocks<T> blocks = blocks_of(*buffer);
-        const std::size_t floats = std::size_t{pixels} * channels;
-        // Taken arrays are the camera's own, which nobody else sees any more; otherwise they are copied.
-        const auto own = [&](const T* block) {
-            if (take) return const_cast<T*>(block);
-            float* copy = memory.allocate(floats);
-            std::memcpy(copy, block, floats * sizeof(float));
-            return reinterpret_cast<T*>(copy);
+        constexpr std::size_t channels = sizeof((*buffer)[0]) / sizeof(float);
+        const BufferBlocks blocks = blocks_of(*buffer);
+        const std::size_t floats = pixels * channels;
+        // What is taken is ours alone from here on; otherwise the render still needs it as it is.
+        const auto array = [&](const float* block) {
+            return take ? const_cast<float*>(block) : memory.copy(block, floats);
         };
-        T* mean = reinterpret_cast<T*>(memory.allocate(floats));
-        // Elsewhere light also arrives by splatting, which no half knows of: only the whole image is sound.
-        const bool halves = plan.writes_features;
-        T* variance = halves ? own(blocks.squared_deviations) : nullptr;
+        const Quantity quantity{name,
+                                static_cast<int>(channels),
+                                memory.allocate(floats),
+                                array(blocks.half_a),
+                                array(blocks.half_b),
+                                array(blocks.squared_deviations)};
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
-            for (std::uint32_t i = begin; i < end; ++i) {
-                if (halves) {
-                    const float n = static_cast<float>(blocks.counts[i]);
-                    mean[i] = (*buffer)[i];
-                    variance[i] = variance[i] / std::max(1.0f, n * (n - 1.0f));
-                } else if constexpr (channels == 3) {
-                    mean[i] = camera.getLinear(static_cast<int>(i % width), static_cast<int>(i / width));
-                }
-            }
+            combine(blocks, channels, begin, end, quantity.mean, quantity.variance);
         });
-        evidence.quantities.push_back(
-            Quantity{name, channels, reinterpret_cast<float*>(mean),
-                     halves ? reinterpret_cast<float*>(own(blocks.half_a)) : nullptr,
-                     halves ? reinterpret_cast<float*>(own(blocks.half_b)) : nullptr,
-                     reinterpret_cast<float*>(variance)});
+        evidence.quantities.push_back(quantity);
 
-        if (type == OutputColor && halves) {
-            const std::uint32_t* counts = blocks.counts;
-            const auto [fewest, most] = std::minmax_element(counts, counts + pixels);
-            evidence.uniform_spp = static_cast<float>(*most);
-            if (*fewest != *most) {
+        if (type == OutputColor) {
+            const std::uint32_t *first = blocks.counts, *last = first + pixels;
+            evidence.uniform_spp = static_cast<float>(*first);
+            if (std::find_if(first, last, [=](std::uint32_t count) { return count != *first; }) != last) {
                 evidence.spp = memory.allocate(pixels);
-                std::copy(counts, counts + pixels, evidence.spp);
+                std::copy(first, last, evidence.spp);
             }
         }
-        if (take) memory.buffers.emplace_back(std::move(buffer));
+        if (take) memory.own(std::move(buffer));
     });
     return evidence;
 }
@@ -424,20 +503,6 @@ Evidence Render::take_evidence() {
     impl_->traceable.reset();
     impl_->scene.reset();
     return evidence;
-}
-
-void save_ldr(const std::string& path, std::span<const float> radiance, int width, int height,
-              const std::string& tonemap) {
-    const Tonemap::Type op(tonemap);
-    std::vector<uint8> image(radiance.size());
-    for (std::size_t i = 0; i + 2 < radiance.size(); i += 3) {
-        const Vec3f linear = max(Vec3f(radiance[i], radiance[i + 1], radiance[i + 2]), Vec3f(0.0f));
-        const Vec3f encoded = Tonemap::tonemap(op, linear) * 255.0f;
-        for (unsigned c = 0; c < 3; ++c)
-            image[i + c] = encoded[c] > 0.0f ? static_cast<uint8>(std::min(encoded[c], 255.0f)) : uint8{0};
-    }
-    if (!ImageIO::saveLdr(Path(path), image.data(), width, height, 3))
-        throw std::runtime_error(path + ": could not be written; check the folder and its free space");
 }
 
 const char* tungsten_version() { return VERSION_STRING; }

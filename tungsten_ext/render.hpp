@@ -6,7 +6,6 @@
 #include <cstdint>
 #include <memory>
 #include <optional>
-#include <span>
 #include <string>
 #include <vector>
 
@@ -96,11 +95,6 @@ class Render {
     struct Impl;
     std::unique_ptr<Impl> impl_;
 };
-
-// Writes linear radiance (3 floats per pixel) as Tungsten writes its low dynamic range image: tonemapped, PNG
-// or JPEG.
-void save_ldr(const std::string& path, std::span<const float> radiance, int width, int height,
-              const std::string& tonemap);
 
 // The version of the Tungsten that was found.
 const char* tungsten_version();

@@ -3,10 +3,11 @@
 #include "render.hpp"
 
 // Tungsten's driver relies on being included after these.
-#include <Version.hpp>
 #include <iostream>
 #include <memory>
-#include <tungsten/Shared.hpp>
+
+#include "Version.hpp"
+#include "tungsten/Shared.hpp"
 
 namespace tungsten_dip {
 

@@ -168,7 +168,8 @@ def drive(
     try:
         interrupted = _render_passes(session, Path(scene_path), options, checkpoint, progress)
     finally:
-        session.save_outputs()
+        if session.current_spp > 0:
+            session.save_outputs()
     if interrupted:
         raise KeyboardInterrupt
     if failure is not None:
@@ -262,7 +263,7 @@ def _render_passes(
     if not plan.writes_features:
         _log.info("%s: the integrator %s writes no feature buffers: colour alone", scene, plan.integrator)
     if checkpoint is not None and plan.resume and not options.restart:
-        _resume(session)
+        _resume(session, scene)
     interval_s = options.checkpoint_interval_s
     interval_s = plan.checkpoint_interval_s if interval_s is None else interval_s
     timeout_s = plan.timeout_s if options.timeout_s is None else options.timeout_s
@@ -289,12 +290,12 @@ def _render_passes(
     return False
 
 
-def _resume(session: Any) -> None:
+def _resume(session: Any, scene: Path) -> None:
     try:
         resumed = session.resume()
     except RuntimeError as error:
-        _log.warning("the saved state cannot be read: %s", error)
-        resumed = False
+        message = f"{scene}: its saved state cannot be read: {error}; delete it, or render with --restart"
+        raise InputError(" ".join(message.split())) from None
     if resumed:
         _log.info("resuming at %d spp", session.current_spp)
     else:
