@@ -15,20 +15,28 @@ from tungsten_dip.scene import types as ts
 _WHITE = (1.0, 1.0, 1.0)
 _SMALLEST_ALPHA = 1e-3  # Tungsten clamps roughness here
 
+# Absorption of the two pigments of hair, per radius.
+# d'Eon et al., "An Energy-Conserving Hair Reflectance Model", EGSR 2011.
+_EUMELANIN = (0.419, 0.697, 1.37)
+_PHEOMELANIN = (0.187, 0.4, 1.05)
 
-def bsdf_object(t: Translation, bsdf: ts.Bsdf, uv: Matrix = UV) -> Any:
+
+def bsdf_object(t: Translation, bsdf: ts.Bsdf, uv: Matrix = UV, *, faces_viewer: bool = False) -> Any:
     """Return the Mitsuba BSDF for a surface with this parameterisation, and note its albedo texture.
+
+    ``faces_viewer`` is for hair on curves whose normal Tungsten turns towards the viewer.
 
     Raises InputError for what has no counterpart.
     """
-    key = ("bsdf", bsdf, uv.tobytes().hex())
+    key = ("bsdf", bsdf, uv.tobytes().hex(), faces_viewer)
     found = t.made(key)
     if found is not None:
         return found
     outer, t.place = t.place, f"{t.place}, {_named(bsdf)}" if t.place else _named(bsdf)
     if bsdf.bump is not None and not is_constant(bsdf.bump):
         raise t.unsupported("bump mapping")
-    built = t.add_object("bsdf", _node(t, bsdf, uv))
+    node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(t, bsdf, uv)
+    built = t.add_object("bsdf", node)
     t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
     t.place = outer
     return t.remember(key, built)
@@ -232,6 +240,23 @@ def _null(t: Translation, bsdf: ts.NullBsdf, uv: Matrix) -> Node:
 
 def _forward(t: Translation, bsdf: ts.ForwardBsdf, uv: Matrix) -> Node:
     return {"type": "null"}
+
+
+def _hair(bsdf: ts.HairBsdf, faces_viewer: bool) -> Node:
+    sigma_a = bsdf.sigma_a
+    if sigma_a is None:
+        r, g, b = (
+            bsdf.melanin_concentration * (eumelanin + bsdf.melanin_ratio * (pheomelanin - eumelanin))
+            for eumelanin, pheomelanin in zip(_EUMELANIN, _PHEOMELANIN, strict=True)
+        )
+        sigma_a = (r, g, b)
+    return {
+        "type": "tungsten_hair",
+        "roughness": bsdf.roughness,
+        "scale_angle": bsdf.scale_angle,
+        "sigma_a": {"type": "rgb", "value": list(sigma_a)},
+        "faces_viewer": faces_viewer,
+    }
 
 
 _TRANSLATORS: dict[type[ts.Bsdf], Callable[[Translation, Any, Matrix], Node]] = {

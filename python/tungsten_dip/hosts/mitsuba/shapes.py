@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.bsdfs import bsdf_object
+from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
 from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, largest_value, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, transform
@@ -56,6 +57,8 @@ def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
             return [_disk(t, primitive)]
         case ts.Cylinder():
             return _cylinder(t, primitive)
+        case ts.Curves():
+            return curve_shapes(t, primitive)
         case ts.Instances():
             return _instances(t, primitive)
     raise t.unsupported(f"a primitive of type {primitive.kind}")
