@@ -303,7 +303,6 @@ class TungstenPath final : public Variant::Integrator {
 
     TensorXf render(Scene* scene, Sensor* sensor, uint32_t seed, uint32_t spp, bool /*develop*/,
                     bool /*evaluate*/) override {
-        m_stop = false;
         m_render_timer.reset();
         sees_through_ = has_transparency(*scene);
         const auto size = sensor->film()->crop_size();

@@ -434,9 +434,12 @@ def test_a_failing_progress_callback_ends_the_render() -> None:
         render_translated(ball((256, 256)), spp=1_000_000, progress=fail)
 
 
-@pytest.mark.parametrize("arguments", [{"spp": 0}, {"spp": 1, "seed": -1}, {"spp": 1, "threads": 0}])
-def test_arguments_out_of_range(arguments: dict[str, int]) -> None:
-    with pytest.raises(InputError, match="expected a number"):
+@pytest.mark.parametrize(
+    "arguments",
+    [{"spp": 0}, {"spp": 1, "seed": -1}, {"spp": 1, "threads": 0}, {"spp": 1, "quantities": ("depth",)}],
+)
+def test_arguments_out_of_range(arguments: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"expected (a number|color)"):
         render_translated(ball(), **arguments)
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
@@ -22,16 +23,17 @@ def render(
     spp: int | None = None,
     seed: int | None = None,
     threads: int | None = None,
-    timeout_s: float | None = None,
     progress: Progress = silent,
 ) -> RenderBuffers:
     """Render a scene, given itself or its file, and return colour and features with independent halves.
 
     ``host`` "auto" is Tungsten where the package was built against it, else Mitsuba. None takes the scene's
-    ``spp``, the host's own seed, all cores, and no timeout. Writes no file.
+    ``spp``, and the host's own seed and number of threads. Writes no file.
 
     Raises InputError if the scene or the host cannot be used.
     """
+    if host not in get_args(Host):
+        raise InputError(f"host: expected one of {', '.join(get_args(Host))}, got {host}")
     from tungsten_dip.hosts import tungsten
     from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 
@@ -42,4 +44,4 @@ def render(
     _log.info("%s: rendered by %s", scene.path, host.capitalize())
     if host == "tungsten":
         return tungsten.render(scene.path, spp=spp, seed=seed, threads=threads, progress=progress)
-    return render_with_mitsuba(scene, spp, seed or 0, threads, timeout_s, progress)
+    return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)

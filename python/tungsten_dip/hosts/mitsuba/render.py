@@ -15,16 +15,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Scene
-
-Doubles = npt.NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
@@ -98,6 +95,8 @@ def render_translated(
     for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
         if value is not None and value < 1:
             raise InputError(f"{name}: expected a number above 0, got {value}")
+    if "color" not in quantities:
+        raise InputError(f"quantities: expected color among them, got {', '.join(quantities)}")
     if not 0 <= seed < 2**32:
         raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {seed}")
     started = time.perf_counter()
@@ -153,14 +152,13 @@ def _part(progress: Progress, done_spp: int, pass_spp: int, spp: int) -> Progres
     return lambda fraction, message: progress((done_spp + fraction * pass_spp) / spp, message)
 
 
-def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progress) -> Doubles:
+def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progress) -> FloatImage:
     """Render in a thread of its own, so that this one can report progress and be interrupted."""
     integrator = scene.integrator()
     parameters = mitsuba.traverse(integrator)
     level = mitsuba.log_level()
-    mitsuba.set_log_level(
-        mitsuba.LogLevel.Error
-    )  # Mitsuba logs from its handler of Ctrl-C, where Python cannot
+    # Mitsuba warns from within its handler of Ctrl-C, where no Python may run.
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
     try:
         with ThreadPoolExecutor(max_workers=1) as executor:
             rendering = executor.submit(integrator.render, scene, scene.sensors()[0], seed, spp)
@@ -172,7 +170,7 @@ def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progre
                 raise
     finally:
         mitsuba.set_log_level(level)
-    pixels = np.array(rendering.result(), dtype=np.float64)
+    pixels: FloatImage = np.array(rendering.result(), dtype=np.float32)
     if integrator.should_stop():
         raise KeyboardInterrupt
     progress(1.0, "rendering")
@@ -183,18 +181,18 @@ def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progre
 class _Statistics:
     """What is known of one quantity, shape (height, width, channels); the counts have one channel."""
 
-    half_a: Doubles
-    half_b: Doubles
-    count_a: Doubles
-    count_b: Doubles
-    squared_deviations: Doubles
+    half_a: FloatImage
+    half_b: FloatImage
+    count_a: FloatImage
+    count_b: FloatImage
+    squared_deviations: FloatImage
 
     @property
-    def count(self) -> Doubles:
+    def count(self) -> FloatImage:
         return self.count_a + self.count_b
 
     @property
-    def mean(self) -> Doubles:
+    def mean(self) -> FloatImage:
         return _weighted_mean(self.half_a, self.count_a, self.half_b, self.count_b)
 
     def merged(self, other: _Statistics) -> _Statistics:
@@ -212,25 +210,26 @@ class _Statistics:
 
     def buffer(self, has_halves: bool) -> Buffer:
         """Return the means and the variance of the mean, as Tungsten writes them."""
-        mean = self.mean.astype(np.float32)
         if not has_halves:
-            return Buffer(mean)
+            return Buffer(self.mean)
         variance = self.squared_deviations / np.maximum(self.count * (self.count - 1), 1)
-        return Buffer(mean, *(plane.astype(np.float32) for plane in (self.half_a, self.half_b, variance)))
+        return Buffer(self.mean, self.half_a, self.half_b, variance)
 
 
-def _weighted_mean(a: Doubles, weight_a: Doubles, b: Doubles, weight_b: Doubles) -> Doubles:
-    return (a * weight_a + b * weight_b) / np.maximum(weight_a + weight_b, 1)
+def _weighted_mean(a: FloatImage, weight_a: FloatImage, b: FloatImage, weight_b: FloatImage) -> FloatImage:
+    mean: FloatImage = (a * weight_a + b * weight_b) / np.maximum(weight_a + weight_b, 1)
+    return mean
 
 
-def _statistics(pixels: Doubles, quantities: Sequence[str]) -> dict[str, _Statistics]:
+def _statistics(pixels: FloatImage, quantities: Sequence[str]) -> dict[str, _Statistics]:
     """Split what the integrator returns; mitsuba_ext/tungsten_path.cpp describes it."""
     statistics = {}
     start = 0
     for name in quantities:
         channels = CHANNELS[name]
         half_a, half_b, squared_deviations = (
-            pixels[..., start + i * channels : start + (i + 1) * channels] for i in range(3)
+            np.ascontiguousarray(pixels[..., start + i * channels : start + (i + 1) * channels])
+            for i in range(3)
         )
         start += 3 * channels + 1
         count = pixels[..., start - 1 : start]

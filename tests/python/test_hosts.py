@@ -1,0 +1,74 @@
+"""Which host renders, and that a scene file goes through it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tungsten_dip import hosts
+from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.hosts import tungsten
+
+
+@pytest.fixture
+def scene_path(tmp_path: Path) -> Path:
+    """A gray floor seen from above, under a white sky."""
+    scene = {
+        "bsdfs": [{"name": "gray", "type": "lambert", "albedo": 0.5}],
+        "primitives": [
+            {"type": "quad", "bsdf": "gray", "transform": {"scale": 9}},
+            {"type": "infinite_sphere", "emission": 1},
+        ],
+        "camera": {
+            "type": "pinhole",
+            "resolution": [5, 3],
+            "fov": 40,
+            "transform": {"position": [0, 2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1]},
+        },
+        "integrator": {"type": "path_tracer"},
+        "renderer": {"spp": 16},
+    }
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(scene))
+    return path
+
+
+def test_mitsuba_renders_a_scene_file(scene_path: Path) -> None:
+    buffers = hosts.render(scene_path, host="mitsuba")
+    assert (buffers.width, buffers.height, buffers.spp) == (5, 3, 16)
+    assert buffers.albedo is not None
+    np.testing.assert_allclose(buffers.albedo.mean, 0.5, rtol=1e-5)
+    assert buffers.color.mean.mean() == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("has_tungsten", "expected"), [(True, "Tungsten"), (False, "Mitsuba")])
+def test_auto_prefers_tungsten_and_says_who_renders(
+    has_tungsten: bool,
+    expected: str,
+    scene_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    asked = []
+
+    def render_with_tungsten(path: Path, **options: Any) -> RenderBuffers:
+        asked.append((path, options["spp"]))
+        return RenderBuffers(Buffer(np.zeros((3, 5, 3), np.float32)))
+
+    monkeypatch.setattr(tungsten, "available", lambda: has_tungsten)
+    monkeypatch.setattr(tungsten, "render", render_with_tungsten)
+    with caplog.at_level(logging.INFO):
+        hosts.render(scene_path, spp=2)
+    assert f"rendered by {expected}" in caplog.text
+    assert asked == ([(scene_path, 2)] if has_tungsten else [])
+
+
+def test_unknown_host(scene_path: Path) -> None:
+    with pytest.raises(InputError, match="host: expected one of auto, tungsten, mitsuba, got blender"):
+        hosts.render(scene_path, host="blender")  # type: ignore[arg-type]
