@@ -149,7 +149,7 @@ def _scene_with_integrator(
 
 
 def _part(progress: Progress, done_spp: int, pass_spp: int, spp: int) -> Progress:
-    return lambda fraction, message: progress((done_spp + fraction * pass_spp) / spp, message)
+    return lambda fraction, _: progress((done_spp + fraction * pass_spp) / spp, f"{spp} spp")
 
 
 def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progress) -> FloatImage:
@@ -164,7 +164,7 @@ def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progre
             rendering = executor.submit(integrator.render, scene, scene.sensors()[0], seed, spp)
             try:
                 while not wait([rendering], timeout=_POLL_S).done:
-                    progress(float(parameters["progress"]), "rendering")
+                    progress(float(parameters["progress"]), "")
             except BaseException:
                 integrator.cancel()
                 raise
@@ -173,7 +173,7 @@ def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progre
     pixels: FloatImage = np.array(rendering.result(), dtype=np.float32)
     if integrator.should_stop():
         raise KeyboardInterrupt
-    progress(1.0, "rendering")
+    progress(1.0, "")
     return pixels
 
 
