@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,14 @@ mitsuba = pytest.importorskip("mitsuba", reason="the embedded host needs the pac
 import OpenImageIO  # noqa: E402
 
 from tungsten_dip.errors import InputError  # noqa: E402
+from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render_translated  # noqa: E402
 from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant  # noqa: E402
+from tungsten_dip.hosts.mitsuba.sky import sky_pixels  # noqa: E402
 from tungsten_dip.hosts.mitsuba.translate import translate  # noqa: E402
+from tungsten_dip.hosts.mitsuba.translation import Translation  # noqa: E402
 from tungsten_dip.scene.parse import load_scene  # noqa: E402
+from tungsten_dip.scene.types import Skydome  # noqa: E402
 
 Json = dict[str, Any]
 
@@ -88,6 +93,9 @@ def folder(tmp_path: Path) -> Path:
     write_image(tmp_path / "alpha.png", rng.integers(0, 256, (3, 5, 4), dtype=np.uint8))
     write_image(tmp_path / "sky.hdr", rng.random((5, 8, 3)).astype(np.float32))
     (tmp_path / "mesh.obj").write_text("v -1 0 0\nv 1 0 0\nv 1 1 0\nv -1 1 0.3\nf 1 2 3\nf 1 3 4\n")
+    strands = np.array([[x, y, 0.1 * y * y] for x in (-0.5, 0.0, 0.5) for y in (0, 0.4, 0.9, 1.5)], "<f4")
+    header = struct.pack("<4sIIIIff3f88x", b"HAIR", 3, len(strands), 2, 3, 0.05, 0.0, 1.0, 1.0, 1.0)
+    (tmp_path / "strands.hair").write_bytes(header + strands.tobytes())
     return tmp_path
 
 
@@ -132,6 +140,7 @@ BSDFS: dict[str, Json] = {
     "forward": {"type": "forward"},
 }
 
+CURVES = {"type": "curves", "file": "strands.hair", "curve_thickness": 0.05}
 TURNED = {"position": [0, 0.8, 0], "rotation": [30, 40, 20], "scale": [0.9, 0.5, 0.7]}
 PRIMITIVES: dict[str, list[Json]] = {
     "quad": [{"type": "quad", "transform": TURNED, "bsdf": {"type": "lambert", "albedo": "colour.png"}}],
@@ -151,6 +160,10 @@ PRIMITIVES: dict[str, list[Json]] = {
     "smooth mesh": [
         {"type": "mesh", "file": "mesh.obj", "smooth": True, "recompute_normals": True, "bsdf": GREY}
     ],
+    "curves": [{**CURVES, "bsdf": GREY, "subsample": 0.3, "curve_taper": True}],
+    "hair": [{**CURVES, "mode": "bcsdf_cylinder", "bsdf": {"type": "hair", "roughness": 0.3}}],
+    "hair on half cylinders": [{**CURVES, "bsdf": {"type": "hair", "sigma_a": [0.5, 1, 2]}}],
+    "skydome": [{"type": "skydome", "transform": {"rotation": [40, 30, 0]}}],
     "point": [{"type": "point", "transform": {"position": [1, 2, 1]}, "power": 9.0}],
     "infinite_sphere": [{"type": "infinite_sphere", "emission": "sky.hdr"}],
     "infinite_sphere_cap": [{"type": "infinite_sphere_cap", "power": 3.0, "cap_angle": 5}],
@@ -321,6 +334,43 @@ def test_without_lights_the_sky_is_white(folder: Path) -> None:
     np.testing.assert_allclose(buffers.color.mean.mean(), 1.0, rtol=0.02)
 
 
+def test_hair_without_absorption_makes_and_loses_no_light(folder: Path) -> None:
+    hair = {"type": "hair", "roughness": 0.3, "sigma_a": 0.0}
+    strands = {**CURVES, "curve_thickness": 0.3, "mode": "bcsdf_cylinder", "bsdf": hair}
+    buffers = render(folder, [strands, WHITE_SKY], {"fov": 2}, spp=64)
+    np.testing.assert_allclose(buffers.color.mean.mean(axis=(0, 1)), 1.0, rtol=0.03)
+
+
+def test_a_segment_of_a_curve_stays_the_same_curve() -> None:
+    points = np.random.default_rng(2).normal(size=(3, 5, 4))
+    cubic = cubic_from_quadratic(*points)
+    time = np.linspace(0.0, 1.0, 7)[:, None, None]
+    p0, p1, p2 = points
+    quadratic = 0.5 * ((1 - time) ** 2 * p0 + (1 + 2 * time - 2 * time**2) * p1 + time**2 * p2)
+    weights = [
+        (1 - time) ** 3,
+        3 * time**3 - 6 * time**2 + 4,
+        -3 * time**3 + 3 * time**2 + 3 * time + 1,
+        time**3,
+    ]
+    evaluated = sum(weight * cubic[:, i] for i, weight in enumerate(weights)) / 6
+    np.testing.assert_allclose(evaluated, quadratic, atol=1e-12)
+
+
+def test_the_sky_has_the_spectrum_and_the_symmetry_of_the_model(folder: Path) -> None:
+    path = folder / "scene.json"
+    path.write_text(json.dumps({"primitives": [{"type": "skydome", "intensity": 3}, {"type": "skydome"}]}))
+    bright, dim = load_scene(path).primitives
+    assert isinstance(bright, Skydome)
+    assert isinstance(dim, Skydome)
+    with mitsuba_variant():
+        pixels, half = (sky_pixels(Translation(load_scene(path)), sky) for sky in (bright, dim))
+    np.testing.assert_allclose(pixels, 1.5 * half)
+    np.testing.assert_allclose(pixels[:128], np.broadcast_to(pixels[:128, :1], (128, 512, 3)), rtol=1e-6)
+    assert (pixels[64, 0, 2] > pixels[64, 0, 0]).all()  # blue
+    assert not pixels[130:].any()
+
+
 @pytest.mark.parametrize("kind", ["pinhole", "thinlens"])
 def test_a_point_projects_where_tungsten_puts_it(folder: Path, kind: str) -> None:
     position, target = np.array([1.0, 2.0, 3.0]), np.array([0.2, 0.5, -1.0])
@@ -462,6 +512,12 @@ REFUSED: dict[str, Json] = {
     "infinite_sphere with a texture": {
         "primitives": [{"type": "infinite_sphere", "emission": {"type": "checker"}}]
     },
+    "sun is below the horizon": {"primitives": [{"type": "skydome", "transform": {"rotation": [120, 0, 0]}}]},
+    "skydome of turbidity": {"primitives": [{"type": "skydome", "turbidity": 11}]},
+    "curves of mode ribbon": {"primitives": [{**CURVES, "mode": "ribbon"}]},
+    "lambert on curves": {"primitives": [{**CURVES, "mode": "bcsdf_cylinder", "bsdf": GREY}]},
+    "shining curves": {"primitives": [{**CURVES, "emission": 1.0}]},
+    "texture on curves": {"primitives": [{**CURVES, "bsdf": {"type": "lambert", "albedo": "colour.png"}}]},
     "more than one light": {"primitives": [WHITE_SKY, WHITE_SKY]},
     "file of instances": {"primitives": [{"type": "instances", "masters": [FLOOR], "instances": "many.bin"}]},
     "cubemap": with_camera(type="cubemap"),

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.hosts.mitsuba.sky import sky_pixels
 from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, largest_value
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
@@ -39,7 +40,7 @@ def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
     Raises InputError for a texture without counterpart.
     """
     if isinstance(primitive, ts.Skydome):
-        raise t.unsupported("a skydome")
+        return envmap_node(sky_pixels(t, primitive), np.eye(3))
     texture = primitive.emitter
     if texture is None or largest_value(t, texture) <= 0.0:
         return None
