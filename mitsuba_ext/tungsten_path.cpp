@@ -625,7 +625,10 @@ class TungstenPath final : public Variant::Integrator {
         for (Rgb result(1.f);;) {
             auto preliminary = scene.ray_intersect_preliminary(ray);
             const bool is_hit = preliminary.is_valid();
-            if (is_hit && !has_flag(preliminary.shape->bsdf()->flags(), BSDFFlags::Null)) return {0.f};
+            // Within an instance the shape is not known yet; what is opaque there lets nothing through below.
+            if (is_hit && preliminary.instance == nullptr &&
+                !has_flag(preliminary.shape->bsdf()->flags(), BSDFFlags::Null))
+                return {0.f};
             const float distance = is_hit ? preliminary.t : ray.maxt;
             if (medium != nullptr) result *= transmittance(*medium, ray, distance, random);
             if (!is_hit) return bounce >= min_bounces_ ? result : Rgb(0.f);
