@@ -1,0 +1,185 @@
+"""The embedded renderer against the real one: same pictures, same features, same noise.
+
+Runs where the environment variable Tungsten_BUILD names the build folder of a Tungsten.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tungsten_dip.buffers.model import Buffer
+from tungsten_dip.buffers.read import read_buffers
+from tungsten_dip.hosts.mitsuba.render import render
+from tungsten_dip.scene.parse import load_scene
+
+BUILD = os.environ.get("Tungsten_BUILD")  # noqa: SIM112
+pytestmark = pytest.mark.skipif(not BUILD, reason="Tungsten_BUILD names no build of Tungsten")
+
+QUANTITIES = ("color", "albedo", "normal", "depth")
+HALF_PRECISION = 1e-3
+"""Tungsten writes half floats; pixels without noise agree to this, relative."""
+
+ROOM: dict[str, Any] = {
+    "media": [],
+    "bsdfs": [
+        {"name": "mirror", "type": "mirror", "albedo": 0.9},
+        {"name": "glass", "type": "dielectric", "ior": 1.5},
+        {"name": "plastic", "type": "plastic", "ior": 1.5, "albedo": [0.2, 0.5, 0.7]},
+        {"name": "sheet", "type": "thinsheet", "ior": 1.5},
+        {"name": "red", "type": "lambert", "albedo": [0.8, 0.2, 0.2]},
+        {"name": "veil", "type": "transparency", "alpha": 0.5, "base": "red"},
+        {"name": "phong", "type": "phong", "albedo": 0.9, "exponent": 40},
+        {"name": "mixed", "type": "mixed", "bsdf0": "phong", "bsdf1": "red", "ratio": 0.4},
+        {"name": "light", "type": "null"},
+        {"name": "forward", "type": "forward"},
+        {
+            "name": "floor",
+            "type": "lambert",
+            "albedo": {
+                "type": "checker",
+                "on_color": 0.8,
+                "off_color": [0.2, 0.3, 0.2],
+                "res_u": 8,
+                "res_v": 8,
+            },
+        },
+    ],
+    "primitives": [
+        {"type": "quad", "bsdf": "floor", "transform": {"scale": [8, 1, 8]}},
+        {"type": "sphere", "bsdf": "mirror", "transform": {"position": [-1.5, 0.5, 0], "scale": 0.5}},
+        {"type": "sphere", "bsdf": "glass", "transform": {"position": [-0.5, 0.5, 0.5], "scale": 0.5}},
+        {"type": "sphere", "bsdf": "plastic", "transform": {"position": [0.5, 0.5, 0], "scale": 0.5}},
+        {"type": "sphere", "bsdf": "veil", "transform": {"position": [1.6, 0.5, -0.6], "scale": 0.5}},
+        {"type": "sphere", "bsdf": "mixed", "transform": {"position": [0, 0.3, 1.4], "scale": 0.3}},
+        {
+            "type": "quad",
+            "bsdf": "sheet",
+            "transform": {"position": [1.6, 0.6, 0.4], "scale": [0.8, 1, 0.8], "rotation": [70, 20, 0]},
+        },
+        {
+            "type": "quad",
+            "bsdf": "light",
+            "emission": 10,
+            "transform": {"position": [0, 3, 0], "scale": [1.5, 1, 1.5], "rotation": [180, 0, 0]},
+        },
+        {"type": "infinite_sphere", "emission": 0.3},
+    ],
+    "camera": {
+        "type": "pinhole",
+        "fov": 45,
+        "resolution": [80, 45],
+        "transform": {"position": [0, 1.6, 5], "look_at": [0, 0.6, 0], "up": [0, 1, 0]},
+    },
+    "integrator": {"type": "path_tracer", "max_bounces": 16},
+    "renderer": {
+        "output_file": "",
+        "adaptive_sampling": False,
+        "stratified_sampler": False,
+        "enable_resume_render": False,
+        "spp": 256,
+        "spp_step": 256,
+        "output_buffers": [
+            {
+                "type": name,
+                "hdr_output_file": f"{name}.exr",
+                "two_buffer_variance": True,
+                "sample_variance": True,
+            }
+            for name in QUANTITIES
+        ],
+    },
+}
+
+
+def changed(section: str, **values: Any) -> dict[str, Any]:
+    scene = copy.deepcopy(ROOM)
+    scene[section].update(values)
+    return scene
+
+
+def foggy(**integrator: Any) -> dict[str, Any]:
+    scene = changed("integrator", **integrator)
+    scene["media"].append(
+        {
+            "name": "fog",
+            "type": "homogeneous",
+            "sigma_a": [0.05, 0.1, 0.2],
+            "sigma_s": [0.3, 0.25, 0.2],
+            "phase_function": {"type": "henyey_greenstein", "g": 0.4},
+        }
+    )
+    del scene["primitives"][4:7]
+    for ball in scene["primitives"][1:4]:
+        ball["ext_medium"] = "fog"
+    scene["primitives"].append(
+        {
+            "type": "cube",
+            "bsdf": "forward",
+            "int_medium": "fog",
+            "transform": {"position": [0, 1.5, 0], "scale": [4, 2.98, 3]},
+        }
+    )
+    return scene
+
+
+CASES = {
+    "tent": ROOM,
+    **{
+        name: changed("camera", reconstruction_filter=name)
+        for name in ("dirac", "box", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos")
+    },
+    "thinlens": changed("camera", type="thinlens", aperture_size=0.1, focus_distance=4.5),
+    "bounces": changed("integrator", min_bounces=2, max_bounces=4),
+    "no light sampling": changed("integrator", enable_light_sampling=False),
+    "consistency checks": changed("integrator", enable_consistency_checks=True),
+    "fog": foggy(),
+    "fog, no low orders": foggy(low_order_scattering=False),
+    "fog, no surfaces": foggy(include_surfaces=False),
+    "fog, no light sampling": foggy(enable_volume_light_sampling=False),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_same_picture_up_to_noise(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(CASES[name]))
+    subprocess.run([Path(str(BUILD)) / "tungsten", path.name], cwd=tmp_path, check=True, capture_output=True)
+    theirs = read_buffers(tmp_path)
+    ours = render(load_scene(path))
+    for quantity in QUANTITIES:
+        agree(getattr(ours, quantity), getattr(theirs, quantity), f"{name}: {quantity}")
+
+
+def agree(ours: Buffer, theirs: Buffer, what: str) -> None:
+    """Assert that the difference is noise of the variance that both claim.
+
+    Over the pixels, its root mean square in standard deviations is about 1 (less where half floats round more
+    than samples scatter), its mean is 0 within 5 standard deviations, and silhouettes apart no pixel stands
+    out. The variances agree in the median; those of colour roughly, since the hosts choose lights differently.
+    """
+    assert ours.variance is not None
+    assert theirs.variance is not None
+    # A pixel that no sample was recorded for has a variance of 0 / 0 in Tungsten.
+    known = np.isfinite(theirs.variance) & np.isfinite(theirs.mean)
+    difference = (ours.mean - theirs.mean)[known].astype(np.float64)
+    variance = (ours.variance + theirs.variance)[known].astype(np.float64)
+    rounding = HALF_PRECISION * (np.abs(theirs.mean[known]) + 0.1)
+    deviations = difference / np.sqrt(variance + rounding**2)
+    assert (np.abs(deviations) > 5).mean() < 0.01, what
+    noise_of_mean = np.sqrt(variance.sum() + (rounding**2).sum()) + 0.01 * rounding.sum()
+    assert abs(difference[np.abs(deviations) < 5].sum()) < 5 * noise_of_mean, what
+    assert np.sqrt((deviations[np.abs(deviations) < 5] ** 2).mean()) < 1.15, what
+    noisy = known & (np.minimum(ours.variance, theirs.variance) > (10 * HALF_PRECISION) ** 2 * 0.1)
+    if noisy.sum() > 100:
+        tolerance = 0.4 if what.endswith("color") else 0.15
+        assert np.median(ours.variance[noisy] / theirs.variance[noisy]) == pytest.approx(1, abs=tolerance), (
+            what
+        )
