@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers import read_image
+from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitResult
 from tungsten_dip.hosts import tungsten
 
 ROOT, BUILD = os.environ.get("Tungsten_ROOT"), os.environ.get("Tungsten_BUILD")  # noqa: SIM112
@@ -303,6 +305,40 @@ def test_checkpoints_are_previewed_and_a_failing_preview_does_not_stop_the_rende
     assert seen[0].color.half_a.flags.writeable
     assert "the render goes on without" in caplog.text
     assert {"picture.png", "picture_checkpoint.png"} <= {file.name for file in (tmp_path / "out").iterdir()}
+
+
+@in_process
+def test_the_command_denoises_and_previews_beside_the_renders_own_files(write_scene, tmp_path, monkeypatch):
+    def fit(buffers, settings):
+        asked.append((settings.preset, buffers.spp))
+        return FitResult(color=buffers.color.mean, settings=settings, seconds=0.0, iterations=0)
+
+    asked = []
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.denoise_with_progress", fit)
+    out = tmp_path / "out"
+    flags = [
+        "--host",
+        "tungsten",
+        "-t",
+        "2",
+        "--spp",
+        "8",
+        "-c",
+        "0.000001s",
+        "--dip-denoise",
+        "--dip-preview",
+    ]
+    assert main([*flags, "-d", str(out), str(write_scene(hdr_output_file="picture.exr"))]) == 0
+    assert asked == [("draft", 4), ("balanced", 8)]
+    names = (
+        "picture.png",
+        "picture.exr",
+        "picture_denoised.exr",
+        "picture_denoised.png",
+        "picture_preview.png",
+    )
+    for name in names:
+        assert (out / name).stat().st_size > 0, name
 
 
 @in_process

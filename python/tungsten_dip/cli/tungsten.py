@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import tungsten_dip
@@ -71,8 +71,8 @@ def _run(arguments: Sequence[str] | None) -> None:
         parser.print_help()
         return
     if not options.dip_denoise:
-        for name in (*FIT_OPTIONS, "report"):
-            if getattr(options, name) is not None:
+        for name in (*FIT_OPTIONS, "report", "dip_preview"):
+            if getattr(options, name) not in (None, False):
                 raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
     for name in ("output_file", "hdr_output_file", "report"):
         path, count = getattr(options, name), len(options.scenes)
@@ -83,8 +83,8 @@ def _run(arguments: Sequence[str] | None) -> None:
     if host == "auto":
         host = "tungsten" if tungsten_host.available() else "mitsuba"
     log.info("rendering with %s", host.capitalize())
-    if host == "mitsuba" and options.checkpoint:
-        raise InputError("--checkpoint: Mitsuba saves none; leave it out, or use --host tungsten")
+    if host == "mitsuba" and (options.checkpoint or options.dip_preview):
+        raise InputError("Mitsuba saves no checkpoints: leave --checkpoint and --dip-preview out")
     if host == "tungsten" and not options.dip_denoise:
         tungsten_host.run_native(_stock_arguments(arguments))
     if host == "tungsten" and not tungsten_host.in_process():
@@ -124,6 +124,11 @@ def _parser() -> argparse.ArgumentParser:
     dip = parser.add_argument_group("denoising")
     dip.add_argument("--dip-denoise", action="store_true", help="denoise the picture with a deep image prior")
     add_fit_options(dip, prefix="dip-")
+    dip.add_argument(
+        "--dip-preview",
+        action="store_true",
+        help="denoise quickly at every checkpoint, as <stem>_preview.png (with Tungsten)",
+    )
     dip.add_argument("--dip-report", dest="report", metavar="R.html", type=Path, help=REPORT_HELP)
     return parser
 
@@ -162,7 +167,8 @@ def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: 
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
-                rendered = tungsten_host.drive(path, _driver_options(options), progress=progress)
+                preview = _preview(outputs, settings) if options.dip_preview else None
+                rendered = tungsten_host.drive(path, _driver_options(options), preview, progress)
                 buffers = rendered.buffers
                 left = SceneOutputs(
                     ldr=None if rendered.output_file else outputs.ldr,
@@ -175,6 +181,20 @@ def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: 
             log.info("wrote %s", written)
         if options.dip_denoise:
             denoise_outputs(buffers, outputs, scene.camera.tonemap, settings, options.report, remarks)
+
+
+def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten_host.Rendered], None]:
+    """Return what writes a quickly denoised picture of a render that goes on."""
+    path = outputs.beside("_preview.png")
+    check_writable(path, (path.suffix,))
+    draft = FitSettings(preset="draft", device=settings.device, threads=settings.threads)
+
+    def write(rendered: tungsten_host.Rendered) -> None:
+        result = denoise_with_progress(rendered.buffers, draft)
+        write_image(path, display_from_radiance(result.color, rendered.tonemap))
+        log.info("wrote %s", path)
+
+    return write
 
 
 def _driver_options(options: argparse.Namespace) -> tungsten_host.DriverOptions:

@@ -158,7 +158,7 @@ def drive(
     def checkpoint() -> None:
         nonlocal failure
         session.save_checkpoint()
-        if on_checkpoint is not None and failure is None:
+        if on_checkpoint is not None and failure is None and not session.done:
             try:
                 on_checkpoint(rendered(session.evidence()))
             except Exception as error:
