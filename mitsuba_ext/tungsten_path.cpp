@@ -1,20 +1,18 @@
 // The integrator "tungsten_path": radiance and feature buffers with the meaning that Tungsten's path tracer
 // gives them, from the same camera rays. Variant scalar_rgb only.
 //
-// | parameter                    | type    | meaning |
-// |------------------------------|---------|---------------------------------------------------------------------|
-// | quantities                   | string  | what to record, of color albedo normal depth visibility (all) |
-// | min_bounces, max_bounces     | integer | light is counted on paths of min_bounces to max_bounces - 1
-// bounces,| |                              |         | crossings of transparent surfaces included (0, 64) |
-// | enable_light_sampling        | boolean | sample emitters from surfaces (true) | |
-// enable_volume_light_sampling | boolean | sample emitters from media (true) | | enable_consistency_checks |
-// boolean | drop directions on which shading and geometry disagree (false)      | | low_order_scattering |
-// boolean | light that a medium scattered once counts (true)                    | | include_surfaces |
-// boolean | light that no medium scattered counts (true)                        | | reconstruction_filter |
-// string  | Tungsten's name of the filter that distributes the samples ("tent") | | pixel_center | float   |
-// where in the pixel the filter is centred (0.5)                      | | threads                      |
-// integer | threads, the calling one included (1)                               | | albedo_<id> | texture |
-// the albedo of the BSDF of that id; every BSDF that is seen needs one|
+//   quantities                     what to record, of color albedo normal depth visibility (all)
+//   min_bounces, max_bounces       light counts on paths of min_bounces to max_bounces - 1 bounces, crossings of
+//                                  transparent surfaces included (0, 64)
+//   enable_light_sampling          sample emitters from surfaces (true)
+//   enable_volume_light_sampling   sample emitters from media (true)
+//   enable_consistency_checks      drop directions on which shading and geometry disagree (false)
+//   low_order_scattering           light that a medium scattered once counts (true)
+//   include_surfaces               light that no medium scattered counts (true)
+//   reconstruction_filter          Tungsten's name of the filter that distributes the samples ("tent")
+//   pixel_center                   where in the pixel the filter is centred (0.5)
+//   threads                        number of threads, the calling one included (1)
+//   albedo_<id>                    texture: the albedo of the BSDF of that id; every BSDF that is seen needs one
 //
 // render() returns a tensor of shape (height, width, channels): for every quantity, in the order of
 // `quantities`, its mean, the mean of its even samples (half A), of its odd ones (half B), and the variance
