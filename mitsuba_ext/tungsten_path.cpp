@@ -2,8 +2,8 @@
 // gives them, from the same camera rays. Variant scalar_rgb only.
 //
 //   quantities                     what to record, of color albedo normal depth visibility (all)
-//   min_bounces, max_bounces       light counts on paths of min_bounces to max_bounces - 1 bounces, crossings of
-//                                  transparent surfaces included (0, 64)
+//   min_bounces, max_bounces       light counts on paths of min_bounces to max_bounces - 1 bounces,
+//                                  crossings of transparent surfaces included (0, 64)
 //   enable_light_sampling          sample emitters from surfaces (true)
 //   enable_volume_light_sampling   sample emitters from media (true)
 //   enable_consistency_checks      drop directions on which shading and geometry disagree (false)
@@ -12,7 +12,7 @@
 //   reconstruction_filter          Tungsten's name of the filter that distributes the samples ("tent")
 //   pixel_center                   where in the pixel the filter is centred (0.5)
 //   threads                        number of threads, the calling one included (1)
-//   albedo_<id>                    texture: the albedo of the BSDF of that id; every BSDF that is seen needs one
+//   albedo_<id>                    texture: the albedo of the BSDF of that id; every one that is seen needs it
 //
 // render() returns a tensor of shape (height, width, channels): for every quantity, in the order of
 // `quantities`, its mean, the mean of its even samples (half A), of its odd ones (half B), and the variance
