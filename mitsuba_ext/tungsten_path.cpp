@@ -12,7 +12,7 @@
 //   reconstruction_filter          Tungsten's name of the filter that distributes the samples ("tent")
 //   pixel_center                   where in the pixel the filter is centred (0.5)
 //   threads                        number of threads, the calling one included (1)
-//   albedo_<id>                    texture: the albedo of the BSDF of that id; every one that is seen needs it
+//   albedo_<id>                    texture: the albedo of the BSDF of that id, one for each that is seen
 //
 // render() returns a tensor of shape (height, width, channels): for every quantity, in the order of
 // `quantities`, its mean, the mean of its even samples (half A), of its odd ones (half B), and the variance
