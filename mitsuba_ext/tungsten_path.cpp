@@ -15,9 +15,10 @@
 //   albedo_<id>                    texture: the albedo of the BSDF of that id, one for each that is seen
 //
 // render() returns a tensor of shape (height, width, channels): for every quantity, in the order of
-// `quantities`, its mean, the mean of its even samples (half A), of its odd ones (half B), and the variance
-// of the mean, each with the channels of the quantity. The parameter "progress" is the fraction done and may
-// be read meanwhile.
+// `quantities`, the mean of its even samples (half A), of its odd ones (half B) and the summed squared
+// deviations from the mean of all, each with the channels of the quantity, and then the number of samples. A
+// camera ray need not have a sample of every quantity. The parameter "progress" is the fraction done and may
+// be read meanwhile. cancel() holds for every later render too, so that it cannot come too early.
 //
 // The result depends on the seed alone, not on the number of threads: every pixel has a random stream of its
 // own.
