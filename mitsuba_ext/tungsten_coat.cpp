@@ -16,7 +16,7 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture, BSDF)
 
     explicit Coat(const Properties& props) : Base(props) {
-        for (auto& prop : props.objects())
+        for (const auto& prop : props.objects())
             if (auto* bsdf = prop.try_get<BSDF>()) m_substrate = bsdf;
         if (!m_substrate) Throw("Expected a nested BSDF under the coat");
         m_ior = props.get<float>("ior", 1.3f);

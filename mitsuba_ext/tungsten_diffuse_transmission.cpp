@@ -19,7 +19,7 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::DiffuseTransmission | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         if (!active) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};

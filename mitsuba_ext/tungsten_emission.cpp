@@ -19,7 +19,7 @@ class Emission final : public Texture<Float, Spectrum> {
     MI_IMPORT_TYPES()
 
     explicit Emission(const Properties& props) : Base(props) {
-        for (auto& prop : props.objects())
+        for (const auto& prop : props.objects())
             if (auto* texture = prop.try_get<Base>()) m_texture = texture;
         if (!m_texture) Throw("Expected a nested texture");
     }
@@ -32,9 +32,9 @@ class Emission final : public Texture<Float, Spectrum> {
 
     ScalarFloat max() const override { return m_texture->max(); }
 
-    bool is_spatially_varying() const override { return false; }
+    [[nodiscard]] bool is_spatially_varying() const override { return false; }
 
-    std::string to_string() const override { return "Emission[]"; }
+    [[nodiscard]] std::string to_string() const override { return "Emission[]"; }
 
     MI_DECLARE_CLASS(Emission)
 

@@ -27,9 +27,10 @@ float cosine_of(float sine) { return std::sqrt(std::max(1.f - sine * sine, 0.f))
 // Logarithm of the modified Bessel function of order 0.
 float log_bessel_i0(float x) {
     if (x > 12.f) return x + 0.5f * (std::log(1.f / (kTwoPi * x)) + 1.f / (8.f * x));
-    float sum = 1.f, term = 1.f;
+    float sum = 1.f;
+    float term = 1.f;
     for (int i = 1; i <= 10; ++i) {
-        term *= x * x / (4.f * float(i) * float(i));
+        term *= x * x / (4.f * static_cast<float>(i) * static_cast<float>(i));
         sum += term;
     }
     return std::log(sum);
@@ -37,8 +38,11 @@ float log_bessel_i0(float x) {
 
 // Longitudinal scattering of variance v (equation 7).
 float longitudinal(float v, float sin_i, float sin_o, float cos_i, float cos_o) {
-    const float a = cos_i * cos_o / v, b = sin_i * sin_o / v;
-    if (v < 0.1f) return std::exp(-b + log_bessel_i0(a) - 1.f / v + 0.6931f + std::log(1.f / (2.f * v)));
+    const float a = cos_i * cos_o / v;
+    const float b = sin_i * sin_o / v;
+    if (v < 0.1f)
+        return std::exp(-b + log_bessel_i0(a) - 1.f / v + std::numbers::ln2_v<float> +
+                        std::log(1.f / (2.f * v)));
     return std::exp(-b + log_bessel_i0(a)) / (2.f * v * std::sinh(1.f / v));
 }
 
@@ -67,9 +71,11 @@ template <int count>
 std::array<std::pair<float, float>, count> gauss_legendre() {
     std::array<std::pair<float, float>, count> rule;
     for (int i = 0; i < count; ++i) {
-        double x = std::cos(std::numbers::pi * (i + 0.75) / (count + 0.5)), slope = 0.0;
+        double x = std::cos(std::numbers::pi * (i + 0.75) / (count + 0.5));
+        double slope = 0.0;
         for (int step = 0; step < 20; ++step) {
-            double before = 1.0, value = x;
+            double before = 1.0;
+            double value = x;
             for (int k = 2; k <= count; ++k) {
                 const double next = ((2 * k - 1) * x * value - (k - 1) * before) / k;
                 before = value;
@@ -78,7 +84,8 @@ std::array<std::pair<float, float>, count> gauss_legendre() {
             slope = count * (x * value - before) / (x * x - 1.0);
             x -= value / slope;
         }
-        rule[size_t(i)] = {float(x), float(2.0 / ((1.0 - x * x) * slope * slope))};
+        rule[static_cast<size_t>(i)] = {static_cast<float>(x),
+                                        static_cast<float>(2.0 / ((1.0 - x * x) * slope * slope))};
     }
     return rule;
 }
@@ -87,8 +94,9 @@ std::array<std::pair<float, float>, count> gauss_legendre() {
 class AzimuthalLobe {
   public:
     static constexpr int kSize = 64;
+    static constexpr size_t kTexels = size_t{kSize} * kSize;
 
-    explicit AzimuthalLobe(std::vector<Rgb> values) : values_(std::move(values)), shares_(kSize * kSize) {
+    explicit AzimuthalLobe(std::vector<Rgb> values) : values_(std::move(values)), shares_(kTexels) {
         std::vector<float> weights(values_.size());
         for (int y = 0; y < kSize; ++y)
             for (int x = 0; x < kSize; ++x) {
@@ -102,56 +110,57 @@ class AzimuthalLobe {
         for (int y = 0; y < kSize; ++y) {
             float sum = 0.f;
             for (int x = 0; x < kSize; ++x) sum += weights[at(x, y)];
-            sums_[size_t(y)] = sum;
+            sums_[static_cast<size_t>(y)] = sum;
             for (int x = 0; x < kSize; ++x)
                 shares_[at(x, y)] = sum < 1e-4f ? 1.f / kSize : weights[at(x, y)] / sum;
         }
     }
 
-    Rgb eval(float phi, float cos_half) const {
+    [[nodiscard]] Rgb eval(float phi, float cos_half) const {
         const float u = (kSize - 1) * phi / kTwoPi;
         const Row row(cos_half);
-        const int x = std::clamp(int(u), 0, kSize - 2);
-        const float t = std::clamp(u - float(x), 0.f, 1.f);
+        const int x = std::clamp(static_cast<int>(u), 0, kSize - 2);
+        const float t = std::clamp(u - static_cast<float>(x), 0.f, 1.f);
         const auto along = [&](int y) { return values_[at(x, y)] * (1.f - t) + values_[at(x + 1, y)] * t; };
         return along(row.low) * (1.f - row.part) + along(row.high) * row.part;
     }
 
-    float pdf(float phi, float cos_half) const {
-        const int x = std::clamp(int((kSize - 1) * phi / kTwoPi), 0, kSize - 1);
+    [[nodiscard]] float pdf(float phi, float cos_half) const {
+        const int x = std::clamp(static_cast<int>((kSize - 1) * phi / kTwoPi), 0, kSize - 1);
         return share(x, Row(cos_half)) * kSize / kTwoPi;
     }
 
-    float sample(float cos_half, float u) const {
+    [[nodiscard]] float sample(float cos_half, float u) const {
         const Row row(cos_half);
         for (int x = 0; x < kSize; ++x) {
             const float here = share(x, row);
             if (u < here || x == kSize - 1)
-                return kTwoPi * (float(x) + std::clamp(u / here, 0.f, 1.f)) / kSize;
+                return kTwoPi * (static_cast<float>(x) + std::clamp(u / here, 0.f, 1.f)) / kSize;
             u -= here;
         }
         return 0.f;
     }
 
-    float weight(float cos_i) const {
+    [[nodiscard]] float weight(float cos_i) const {
         const Row row(cos_i);
-        return (sums_[size_t(row.low)] * (1.f - row.part) + sums_[size_t(row.high)] * row.part) * kTwoPi /
-               kSize;
+        return (sums_[static_cast<size_t>(row.low)] * (1.f - row.part) +
+                sums_[static_cast<size_t>(row.high)] * row.part) *
+               kTwoPi / kSize;
     }
 
   private:
     struct Row {
         explicit Row(float cosine)
-            : low(std::clamp(int((kSize - 1) * cosine), 0, kSize - 1)),
+            : low(std::clamp(static_cast<int>((kSize - 1) * cosine), 0, kSize - 1)),
               high(std::min(low + 1, kSize - 1)),
-              part(std::clamp((kSize - 1) * cosine - float(low), 0.f, 1.f)) {}
+              part(std::clamp((kSize - 1) * cosine - static_cast<float>(low), 0.f, 1.f)) {}
         int low, high;
         float part;
     };
 
-    static size_t at(int x, int y) { return size_t(y) * kSize + size_t(x); }
+    static size_t at(int x, int y) { return static_cast<size_t>(y) * kSize + static_cast<size_t>(x); }
 
-    float share(int x, const Row& row) const {
+    [[nodiscard]] float share(int x, const Row& row) const {
         return shares_[at(x, row.low)] * (1.f - row.part) + shares_[at(x, row.high)] * row.part;
     }
 
@@ -162,22 +171,25 @@ class AzimuthalLobe {
 
 // The lobes R, TT and TRT of a strand. Tungsten smooths all three by the roughness of the first.
 std::vector<AzimuthalLobe> azimuthal_lobes(float beta, const Rgb& sigma_a) {
-    constexpr int kSize = AzimuthalLobe::kSize, kPoints = 140, kSamples = 2048;
+    constexpr int kSize = AzimuthalLobe::kSize;
+    constexpr int kPoints = 140;
+    constexpr int kSamples = 2048;
     const auto rule = gauss_legendre<kPoints>();
     std::vector<float> detector(kSamples);
     for (int i = 0; i < kSamples; ++i)
-        detector[size_t(i)] = wrapped_gaussian(beta, float(i) / (kSamples - 1) * kTwoPi);
+        detector[static_cast<size_t>(i)] =
+            wrapped_gaussian(beta, static_cast<float>(i) / (kSamples - 1) * kTwoPi);
     const auto detected = [&](float phi) {
         const float u = std::abs(phi / kTwoPi * (kSamples - 1));
-        const auto x = size_t(u);
-        const float t = u - float(x);
+        const auto x = static_cast<size_t>(u);
+        const float t = u - static_cast<float>(x);
         return detector[x % kSamples] * (1.f - t) + detector[(x + 1) % kSamples] * t;
     };
 
     std::array<std::vector<Rgb>, 3> tables;
-    for (auto& table : tables) table.assign(kSize * kSize, Rgb(0.f));
+    for (auto& table : tables) table.assign(AzimuthalLobe::kTexels, Rgb(0.f));
     for (int y = 0; y < kSize; ++y) {
-        const float cos_half = float(y) / (kSize - 1);
+        const float cos_half = static_cast<float>(y) / (kSize - 1);
         const float sin_squared = 1.f - cos_half * cos_half;
         const float bent_ior = std::sqrt(kEta * kEta - sin_squared) / cos_half;
         const Rgb absorption = sigma_a / std::sqrt(1.f - sin_squared / (kEta * kEta));
@@ -190,16 +202,17 @@ std::vector<AzimuthalLobe> azimuthal_lobes(float beta, const Rgb& sigma_a) {
             const std::array<Rgb, 3> attenuation = {Rgb(reflected), transmitted,
                                                     transmitted * reflected * crossing};
             for (int x = 0; x < kSize; ++x) {
-                const float phi = kTwoPi * float(x) / (kSize - 1);
+                const float phi = kTwoPi * static_cast<float>(x) / (kSize - 1);
                 for (size_t p = 0; p < 3; ++p) {
-                    const float exit = float(p) * (2.f * gamma_t + kPi) - 2.f * gamma_i;
-                    tables[p][size_t(y) * kSize + size_t(x)] +=
+                    const float exit = static_cast<float>(p) * (2.f * gamma_t + kPi) - 2.f * gamma_i;
+                    tables[p][static_cast<size_t>(y) * kSize + static_cast<size_t>(x)] +=
                         0.5f * weight * detected(phi - exit) * attenuation[p];
                 }
             }
         }
     }
     std::vector<AzimuthalLobe> lobes;
+    lobes.reserve(tables.size());
     for (auto& table : tables) lobes.emplace_back(std::move(table));
     return lobes;
 }
@@ -224,7 +237,7 @@ class Hair final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::GlossyTransmission | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         if (!active) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
@@ -255,13 +268,15 @@ class Hair final : public TungstenBsdf<Float, Spectrum> {
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
         const Frame3f strand = strand_frame(si);
         const Vector3f local = strand.to_local(wo);
-        const Inclination in(strand.to_local(si.wi)), out(local);
+        const Inclination in(strand.to_local(si.wi));
+        const Inclination out(local);
         const Float cos_half = std::cos(0.5f * (out.angle - in.angle));
         Float phi = std::atan2(local.x(), local.z());
         if (phi < 0.f) phi += kTwoPi;
 
         Spectrum value(0.f);
-        Float density = 0.f, total = 0.f;
+        Float density = 0.f;
+        Float total = 0.f;
         for (size_t p = 0; p < 3; ++p) {
             const Float theta = in.angle + m_shifts[p];
             const Float along =

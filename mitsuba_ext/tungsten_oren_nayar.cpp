@@ -19,7 +19,7 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         if (!active || si.wi.z() <= 0.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
@@ -35,9 +35,12 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
         const Vector3f& wi = si.wi;
         if (wi.z() <= 0.f || wo.z() <= 0.f) return {Spectrum(0.f), 0.f};
 
-        const Float theta_o = std::acos(std::min(wo.z(), 1.f)), theta_i = std::acos(std::min(wi.z(), 1.f));
-        const Float alpha = std::max(theta_o, theta_i), beta = std::min(theta_o, theta_i);
-        const Float radii = squared(wi.x()) + squared(wi.y()), radii_o = squared(wo.x()) + squared(wo.y());
+        const Float theta_o = std::acos(std::min(wo.z(), 1.f));
+        const Float theta_i = std::acos(std::min(wi.z(), 1.f));
+        const Float alpha = std::max(theta_o, theta_i);
+        const Float beta = std::min(theta_o, theta_i);
+        const Float radii = squared(wi.x()) + squared(wi.y());
+        const Float radii_o = squared(wo.x()) + squared(wo.y());
         const Float norm = std::sqrt(radii * radii_o);
         const Float cos_phi = norm == 0.f ? 1.f : (wi.x() * wo.x() + wi.y() * wo.y()) / norm;
 

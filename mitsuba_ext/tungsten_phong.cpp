@@ -23,7 +23,7 @@ class Phong final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         if (!active || si.wi.z() <= 0.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};

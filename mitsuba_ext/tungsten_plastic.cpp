@@ -33,7 +33,7 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         const Vector3f& wi = si.wi;

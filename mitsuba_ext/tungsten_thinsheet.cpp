@@ -24,8 +24,9 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
         Base::add_component(BSDFFlags::Null | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext&, const SurfaceInteraction3f& si,
-                                             Float sample1, const Point2f&, Mask active) const override {
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& /*unused*/, const SurfaceInteraction3f& si,
+                                             Float sample1, const Point2f& /*unused*/,
+                                             Mask active) const override {
         if (!active) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
         const auto [reflectance, transmittance] = split(si);
         const Float probability = dr::mean(transmittance);
@@ -40,14 +41,15 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
         return {bs, reflectance / (1.f - probability)};
     }
 
-    Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask) const override {
+    Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask /*unused*/) const override {
         return split(si).second;
     }
 
     MI_DECLARE_CLASS(ThinSheet)
 
   protected:
-    std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f&, const Vector3f&) const override {
+    std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& /*unused*/,
+                                        const Vector3f& /*unused*/) const override {
         return {Spectrum(0.f), 0.f};
     }
 
@@ -78,7 +80,8 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
     Spectrum interfering(Float eta, Float cos_i, Float cos_t, Float thickness) const {
         const Float t_s = 4.f * eta * cos_i * cos_t / squared(eta * cos_i + cos_t);
         const Float t_p = 4.f * eta * cos_i * cos_t / squared(eta * cos_t + cos_i);
-        const Float r_s = 1.f - t_s, r_p = 1.f - t_p;
+        const Float r_s = 1.f - t_s;
+        const Float r_p = 1.f - t_p;
         const Spectrum wavelengths(650.f, 510.f, 475.f);
         const Spectrum cos_phase = dr::cos(2.f * kTwoPi * thickness * cos_t * m_ior / wavelengths);
         const auto through = [&](Float t, Float r) {
