@@ -17,9 +17,9 @@ using FloatArray = py::array_t<float, py::array::c_style>;
 
 // An array over memory that lives as long as any array of the same evidence.
 py::object array_over(const Evidence& evidence, float* data, int channels) {
-    if (!data) return py::none();
-    py::capsule owner(new std::shared_ptr<void>(evidence.memory),
-                      [](void* shared) { delete static_cast<std::shared_ptr<void>*>(shared); });
+    if (data == nullptr) return py::none();
+    const py::capsule owner(new std::shared_ptr<void>(evidence.memory),
+                            [](void* shared) { delete static_cast<std::shared_ptr<void>*>(shared); });
     return FloatArray({evidence.height, evidence.width, channels}, data, owner);
 }
 
@@ -33,7 +33,8 @@ py::dict dict_from_evidence(const Evidence& evidence) {
         planes["variance"] = array_over(evidence, quantity.variance, quantity.channels);
         result[quantity.name] = planes;
     }
-    result["spp"] = evidence.spp ? array_over(evidence, evidence.spp, 1) : py::float_(evidence.uniform_spp);
+    result["spp"] =
+        evidence.spp != nullptr ? array_over(evidence, evidence.spp, 1) : py::float_(evidence.uniform_spp);
     return result;
 }
 
@@ -44,12 +45,12 @@ void render_pass(Render& render) {
     constexpr auto signal_poll = 50ms;
     std::optional<py::error_already_set> raised;
     {
-        py::gil_scoped_release release;
+        const py::gil_scoped_release release;
         render.start_pass();
     }
     for (bool finished = false; !finished;) {
         {
-            py::gil_scoped_release release;
+            const py::gil_scoped_release release;
             finished = render.wait_for_pass(signal_poll);
         }
         if (PyErr_CheckSignals() != 0) raised.emplace();
@@ -101,7 +102,7 @@ void bind(py::module_& module) {
             "evidence",
             [](const Render& render) {
                 const auto evidence = [&] {
-                    py::gil_scoped_release release;
+                    const py::gil_scoped_release release;
                     return render.evidence();
                 }();
                 return dict_from_evidence(evidence);
@@ -111,7 +112,7 @@ void bind(py::module_& module) {
             "take_evidence",
             [](Render& render) {
                 const auto evidence = [&] {
-                    py::gil_scoped_release release;
+                    const py::gil_scoped_release release;
                     return render.take_evidence();
                 }();
                 return dict_from_evidence(evidence);

@@ -45,7 +45,7 @@ bool needs_python(int argc, char* argv[]) {
 int run_python(int argc, char* argv[]) {
     namespace fs = std::filesystem;
     const char* asked_python = std::getenv("TUNGSTEN_DIP_PYTHON");
-    const std::string python = asked_python ? asked_python : TUNGSTEN_DIP_PYTHON;
+    const std::string python = asked_python != nullptr ? asked_python : TUNGSTEN_DIP_PYTHON;
     const std::string package = fs::read_symlink("/proc/self/exe").parent_path().parent_path().string();
 
     std::vector<const char*> arguments{argv[0], "-c", run_command, package.c_str()};

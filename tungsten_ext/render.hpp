@@ -1,5 +1,6 @@
-// One scene rendered by Tungsten, and the evidence in its camera's output buffers. Knows neither Python nor,
-// in this header, Tungsten: only render.cpp and stock.cpp see its headers, compiled as Tungsten itself was.
+// One scene rendered by Tungsten, and the evidence in its camera's output buffers. Knows neither Python nor
+// Tungsten: what includes Tungsten's headers is compiled as Tungsten itself was, and meets the rest only
+// here.
 #pragma once
 
 #include <chrono>
@@ -30,9 +31,9 @@ struct Quantity {
     const char* name;
     int channels;
     float* mean;
-    float* half_a;
-    float* half_b;
-    float* variance;
+    float* half_a = nullptr;
+    float* half_b = nullptr;
+    float* variance = nullptr;
 };
 
 // What one render knows. `memory` owns every array; `spp` is null where every pixel has `uniform_spp`
@@ -70,10 +71,10 @@ class Render {
     Render(const Render&) = delete;
     Render& operator=(const Render&) = delete;
 
-    const RenderPlan& plan() const;
-    std::uint32_t current_spp() const;
-    std::uint32_t total_spp() const;
-    bool done() const;
+    [[nodiscard]] const RenderPlan& plan() const;
+    [[nodiscard]] std::uint32_t current_spp() const;
+    [[nodiscard]] std::uint32_t total_spp() const;
+    [[nodiscard]] bool done() const;
 
     // Continues from the saved state of an earlier render with evidence; false where there is none that fits.
     bool resume();
@@ -86,7 +87,7 @@ class Render {
     void save_outputs();
 
     // A copy of what is known so far; the render may go on.
-    Evidence evidence() const;
+    [[nodiscard]] Evidence evidence() const;
     // The buffers themselves, without a copy (only the means are computed). The scene is freed; the render is
     // over.
     Evidence take_evidence();

@@ -1,5 +1,4 @@
-// The stock driver of the found Tungsten, unchanged, except that a scene that failed is seen in the exit
-// status.
+// The stock driver of the found Tungsten, unchanged, but a scene that failed shows in the exit status.
 #include "render.hpp"
 
 // Tungsten's driver relies on being included after these.
@@ -16,7 +15,7 @@ int run_stock(int argc, const char* argv[]) {
     Tungsten::StandaloneRenderer renderer(parser, std::cout);
     parser.parse(argc, argv);
     if (parser.isPresent(Tungsten::OPT_VERSION)) {
-        std::cout << "tungsten, version " << VERSION_STRING << std::endl;
+        std::cout << "tungsten, version " << VERSION_STRING << "\n";
         return 0;
     }
     renderer.setup();
