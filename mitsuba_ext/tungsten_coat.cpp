@@ -55,10 +55,10 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
         below.wi = refracted(wi, in.cos_t);
         const Float reused = (sample1 - probability) / (1.f - probability);
         auto [bs, weight] = m_substrate->sample(context, below, reused, sample2, true);
-        if (dr::all(weight == 0.f) || bs.wo.z() <= 0.f) return {bs, Spectrum(0.f)};
+        if (dr::all(weight == 0.f) || bs.wo.z() <= 0.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
         const Float cos_below = bs.wo.z();
         const FresnelTerm out = dielectric_fresnel(m_ior, cos_below);
-        if (out.reflectance == 1.f) return {bs, Spectrum(0.f)};
+        if (out.reflectance == 1.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
         bs.wo = Vector3f(bs.wo.x() * m_ior, bs.wo.y() * m_ior, out.cos_t);
         bs.sampled_component += 1;
         weight *= (1.f - in.reflectance) * (1.f - out.reflectance);

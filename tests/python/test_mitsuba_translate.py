@@ -136,6 +136,7 @@ BSDFS: dict[str, Json] = {
     "diffuse_transmission": {"type": "diffuse_transmission", "albedo": 0.8},
     "transparency": {"type": "transparency", "alpha": "alpha.png", "base": GREY},
     "mixed": {"type": "mixed", "ratio": "colour.png", "bsdf0": GREY, "bsdf1": {"type": "rough_conductor"}},
+    "mixed with plastic": {"type": "mixed", "albedo": 0.7, "bsdf0": {"type": "smooth_coat"}, "bsdf1": GREY},
     "null": {"type": "null"},
     "forward": {"type": "forward"},
 }
@@ -500,7 +501,9 @@ REFUSED: dict[str, Json] = {
         {"type": "smooth_coat", "substrate": {"type": "dielectric"}}
     ),
     "specular part": surface({"type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY}),
-    "albedo of its own": surface({"type": "mixed", "albedo": 0.5, "bsdf0": WHITE, "bsdf1": GREY}),
+    "two smooth layers": surface(
+        {"type": "mixed", "bsdf0": {"type": "plastic"}, "bsdf1": {"type": "plastic"}}
+    ),
     "sheared quad": surface(GREY, transform=[1, 0, 0.5, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
     "cone_angle": {"primitives": [{"type": "disk", "emission": 1.0, "cone_angle": 30}]},
     "cylinder without caps": {"primitives": [{"type": "cylinder", "emission": 1.0, "capped": False}]},

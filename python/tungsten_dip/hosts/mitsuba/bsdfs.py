@@ -67,20 +67,21 @@ def _transmits(bsdf: ts.Bsdf) -> bool:
     return False
 
 
-def _is_specular(bsdf: ts.Bsdf) -> bool:
-    """Whether some of its light is scattered into single directions, or goes straight on."""
+def _scatters(bsdf: ts.Bsdf) -> bool:
+    """Whether Tungsten mixes it by weight alone: it scatters, and lets nothing straight through."""
     match bsdf:
+        case ts.SmoothCoatBsdf() | ts.RoughCoatBsdf():
+            return _scatters(bsdf.substrate)
         case ts.MixedBsdf():
-            return _is_specular(bsdf.bsdf0) or _is_specular(bsdf.bsdf1)
-        case ts.RoughCoatBsdf():
-            return _is_specular(bsdf.substrate)
-    return not isinstance(
+            return _scatters(bsdf.bsdf0) and _scatters(bsdf.bsdf1)
+    return isinstance(
         bsdf,
         ts.LambertBsdf
         | ts.OrenNayarBsdf
         | ts.PhongBsdf
         | ts.RoughConductorBsdf
         | ts.RoughDielectricBsdf
+        | ts.PlasticBsdf
         | ts.RoughPlasticBsdf
         | ts.DiffuseTransmissionBsdf,
     )
@@ -220,17 +221,19 @@ def _diffuse_transmission(t: Translation, bsdf: ts.DiffuseTransmissionBsdf, uv: 
 
 
 def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
-    for part in (bsdf.bsdf0, bsdf.bsdf1):
-        if _is_specular(part):
-            # Tungsten weights these against each other as if a single direction had a density.
+    parts = (bsdf.bsdf0, bsdf.bsdf1)
+    for part in parts:
+        if not _scatters(part):
+            # Tungsten's light samples and BSDF samples disagree about the share of the other part.
             raise t.unsupported(f"a mixed BSDF with a specular part ({part.kind})")
-    if not is_constant(bsdf.albedo, _WHITE):
-        raise t.unsupported("a mixed BSDF with an albedo of its own")
+    if all(isinstance(part, ts.PlasticBsdf | ts.SmoothCoatBsdf) for part in parts):
+        raise t.unsupported("a mixed BSDF of two smooth layers")
     return {
-        "type": "blendbsdf",
-        "weight": texture_node(t, bsdf.ratio, "average", uv),
-        "bsdf_0": _one_sided(t, bsdf.bsdf1, uv),
-        "bsdf_1": _one_sided(t, bsdf.bsdf0, uv),
+        "type": "tungsten_mixed",
+        "ratio": texture_node(t, bsdf.ratio, "average", uv),
+        "albedo": _albedo(t, bsdf, uv),
+        "bsdf_0": _one_sided(t, bsdf.bsdf0, uv),
+        "bsdf_1": _one_sided(t, bsdf.bsdf1, uv),
     }
 
 
