@@ -455,6 +455,16 @@ def test_two_sided_shading_can_be_switched_off(folder: Path) -> None:
     np.testing.assert_allclose(black, 0.0)
 
 
+def test_a_path_tracer_stands_in_for_what_converges_to_the_same(folder: Path) -> None:
+    bidirectional = {"type": "bidirectional_path_tracer", "max_bounces": 2}
+    path = folder / "scene.json"
+    path.write_text(json.dumps({"primitives": [FLOOR], "integrator": bidirectional}))
+    with mitsuba_variant():
+        translated = translate(load_scene(path))
+    assert translated.integrator.kind == "path_tracer"
+    assert translated.integrator.max_bounces == 2
+
+
 def test_shared_objects_are_made_once(folder: Path) -> None:
     scene = {
         "bsdfs": [{"name": "grey", **GREY}],
@@ -532,10 +542,7 @@ REFUSED: dict[str, Json] = {
     "medium of type atmosphere": with_medium(type="atmosphere"),
     "transmittance of type linear": with_medium(transmittance={"type": "linear"}),
     "fewer bounces": with_medium(max_bounces=3),
-    "integrator of type bidirectional": {
-        "primitives": [FLOOR],
-        "integrator": {"type": "bidirectional_path_tracer"},
-    },
+    "light_tracer": {"primitives": [FLOOR], "integrator": {"type": "light_tracer"}},
 }
 
 

@@ -5,12 +5,16 @@ What agrees, what is approximated (and by how much) and what is refused stands i
 
 from __future__ import annotations
 
+import logging
+
 from tungsten_dip.hosts.mitsuba.emitters import default_environment, environment_node, point_node
 from tungsten_dip.hosts.mitsuba.sensor import pixel_center, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.hosts.mitsuba.translation import Translation
 from tungsten_dip.scene import types as ts
+
+_log = logging.getLogger(__name__)
 
 
 def translate(scene: ts.Scene) -> TranslatedScene:
@@ -20,8 +24,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     for meshes and images that cannot be read.
     """
     t = Translation(scene)
-    if not isinstance(scene.integrator, ts.PathTracer):
-        raise t.unsupported(f"an integrator of type {scene.integrator.kind}")
+    integrator = _path_tracer(t, scene.integrator)
     lights = surroundings = 0
     for number, primitive in enumerate(scene.primitives):
         t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
@@ -45,7 +48,22 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     return TranslatedScene(
         t.scene,
         t.albedo,
-        scene.integrator,
+        integrator,
         scene.camera.reconstruction_filter,
         pixel_center(scene.camera),
+    )
+
+
+def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
+    """Return the path tracer that converges to the picture of an integrator."""
+    if isinstance(integrator, ts.PathTracer):
+        return integrator
+    if isinstance(integrator, ts.LightTracer):
+        raise t.unsupported("a light_tracer, which shows no mirrors,")
+    _log.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
+    return ts.PathTracer(
+        min_bounces=integrator.min_bounces,
+        max_bounces=integrator.max_bounces,
+        enable_consistency_checks=integrator.enable_consistency_checks,
+        enable_two_sided_shading=integrator.enable_two_sided_shading,
     )
