@@ -16,6 +16,7 @@ namespace {
 using FloatArray = py::array_t<float, py::array::c_style>;
 
 // An array over memory that lives as long as any array of the same evidence.
+// NOLINTNEXTLINE(misc-const-correctness): numpy may write to it
 py::object array_over(const Evidence& evidence, float* data, int channels) {
     if (data == nullptr) return py::none();
     const py::capsule owner(new std::shared_ptr<void>(evidence.memory),
@@ -60,7 +61,7 @@ void render_pass(Render& render) {
 
 }  // namespace
 
-void bind(py::module_& module) {
+void bind(const py::module_& module) {
     module.doc() = "Tungsten itself: renders a scene and hands over its camera's buffers.";
     module.attr("tungsten_version") = tungsten_version();
 
@@ -81,9 +82,13 @@ void bind(py::module_& module) {
                          std::optional<std::uint32_t> seed, std::string input_directory,
                          std::string output_directory, std::string output_file, std::string hdr_output_file) {
                  return std::make_unique<Render>(
-                     scene, RenderOptions{threads, spp, seed, std::move(input_directory),
-                                          std::move(output_directory), std::move(output_file),
-                                          std::move(hdr_output_file)});
+                     scene, RenderOptions{.threads = threads,
+                                          .spp = spp,
+                                          .seed = seed,
+                                          .input_directory = std::move(input_directory),
+                                          .output_directory = std::move(output_directory),
+                                          .output_file = std::move(output_file),
+                                          .hdr_output_file = std::move(hdr_output_file)});
              }),
              py::arg("scene"), py::kw_only(), py::arg("threads") = 0, py::arg("spp") = py::none(),
              py::arg("seed") = py::none(), py::arg("input_directory") = "", py::arg("output_directory") = "",

@@ -5,6 +5,6 @@
 
 namespace tungsten_dip {
 
-void bind(pybind11::module_& module);
+void bind(const pybind11::module_& module);
 
 }  // namespace tungsten_dip

@@ -1,11 +1,6 @@
 // The hook: from the camera's output buffers to the arrays that a fit reads.
-#include <sys/mman.h>
-
 #include <algorithm>
-#include <cstdlib>
-#include <cstring>
 #include <memory>
-#include <new>
 #include <thread>
 #include <type_traits>
 #include <utility>
@@ -18,6 +13,9 @@ namespace tungsten_dip {
 using namespace Tungsten;
 
 namespace {
+
+template <typename Value>
+constexpr std::size_t channels_of = std::is_same_v<Value, float> ? 1 : 3;
 
 // For all pixels in [begin, end): the mean of both halves, and, in place, the variance of that mean from the
 // summed squared deviations. Both as OutputBuffer has them, but in runs of equal sample counts, which the
@@ -57,21 +55,9 @@ void parallel_ranges(std::uint32_t items, const F& f) {
 // Owns what an Evidence points into: buffers moved out of the camera, and arrays of our own.
 class EvidenceMemory {
   public:
-    // Large pages: writing to 90 MB of new memory for the first time otherwise takes longer than all else.
-    float* allocate(std::size_t floats) {
-        constexpr std::size_t large_page = std::size_t{2} << 20;
-        const std::size_t bytes = (floats * sizeof(float) + large_page - 1) / large_page * large_page;
-        void* memory = std::aligned_alloc(large_page, bytes);
-        if (memory == nullptr) throw std::bad_alloc();
-        arrays_.emplace_back(memory, std::free);
-        madvise(memory, bytes, MADV_HUGEPAGE);
-        return static_cast<float*>(memory);
-    }
-
-    float* copy(const float* source, std::size_t floats) {
-        float* array = allocate(floats);
-        std::memcpy(array, source, floats * sizeof(float));
-        return array;
+    float* own(std::vector<float> array) {
+        arrays_.push_back(std::move(array));
+        return arrays_.back().data();
     }
 
     template <typename T>
@@ -81,12 +67,23 @@ class EvidenceMemory {
 
   private:
     std::vector<std::shared_ptr<void>> buffers_;
-    std::vector<std::unique_ptr<void, decltype(&std::free)>> arrays_;
+    std::vector<std::vector<float>> arrays_;
 };
 
 }  // namespace
 
-Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, bool take) {
+std::vector<std::vector<float>> means_for(const Camera& camera, bool features) {
+    const std::size_t pixels = camera.resolution().product();
+    std::vector<std::vector<float>> means;
+    for_each_quantity([&](OutputBufferTypeEnum type, const char*, auto member) {
+        using Value = std::decay_t<decltype((*(camera.*member))[0])>;
+        if (type == OutputColor || features) means.emplace_back(pixels * channels_of<Value>);
+    });
+    return means;
+}
+
+Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, std::vector<std::vector<float>> means,
+                     bool take) {
     const auto owner = std::make_shared<EvidenceMemory>();
     EvidenceMemory& memory = *owner;
     const Vec2u size = camera.resolution();
@@ -101,7 +98,7 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, bool take
 
     if (!features) {
         // Light also arrives by splatting, which no half knows of: only the whole image is sound.
-        float* mean = memory.allocate(std::size_t{pixels} * 3);
+        float* mean = memory.own(std::move(means[0]));
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
             for (std::uint32_t i = begin; i < end; ++i) {
                 const Vec3f radiance =
@@ -113,19 +110,19 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, bool take
         return evidence;
     }
 
+    auto mean = means.begin();
     for_each_quantity([&](OutputBufferTypeEnum type, const char* name, auto member) {
         auto& buffer = camera.*member;
-        using Value = std::decay_t<decltype((*buffer)[0])>;
-        constexpr std::size_t channels = std::is_same_v<Value, float> ? 1 : 3;
+        constexpr std::size_t channels = channels_of<std::decay_t<decltype((*buffer)[0])>>;
         const BufferBlocks blocks = blocks_of(*buffer);
         const std::size_t floats = pixels * channels;
         // What is taken is ours alone from here on; otherwise the render still needs it as it is.
         const auto array = [&](const float* block) {
-            return take ? const_cast<float*>(block) : memory.copy(block, floats);
+            return take ? const_cast<float*>(block) : memory.own({block, block + floats});
         };
         const Quantity quantity{.name = name,
                                 .channels = static_cast<int>(channels),
-                                .mean = memory.allocate(floats),
+                                .mean = memory.own(std::move(*mean++)),
                                 .half_a = array(blocks.half_a),
                                 .half_b = array(blocks.half_b),
                                 .variance = array(blocks.squared_deviations)};
@@ -139,8 +136,7 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, bool take
             const std::uint32_t* last = first + pixels;
             evidence.uniform_spp = static_cast<float>(*first);
             if (std::find_if(first, last, [=](std::uint32_t count) { return count != *first; }) != last) {
-                evidence.spp = memory.allocate(pixels);
-                std::copy(first, last, evidence.spp);
+                evidence.spp = memory.own({first, last});
             }
         }
         if (take) memory.own(std::move(buffer));

@@ -33,7 +33,7 @@ sys.argv[0] = "tungsten"
 sys.exit(main(sys.argv[1:]))
 )";
 
-bool needs_python(int argc, char* argv[]) {
+bool needs_python(int argc, char** argv) {
     for (int i = 1; i < argc && std::string_view(argv[i]) != "--"; ++i) {
         const std::string_view argument = argv[i];
         if (argument.starts_with("--dip-") || argument == "--host" || argument.starts_with("--host="))
@@ -42,8 +42,9 @@ bool needs_python(int argc, char* argv[]) {
     return false;
 }
 
-int run_python(int argc, char* argv[]) {
+int run_python(int argc, char** argv) {
     namespace fs = std::filesystem;
+    // NOLINTNEXTLINE(concurrency-mt-unsafe): no other thread runs yet
     const char* asked_python = std::getenv("TUNGSTEN_DIP_PYTHON");
     const std::string python = asked_python != nullptr ? asked_python : TUNGSTEN_DIP_PYTHON;
     const std::string package = fs::read_symlink("/proc/self/exe").parent_path().parent_path().string();
@@ -55,12 +56,12 @@ int run_python(int argc, char* argv[]) {
     PyConfig_InitPythonConfig(&config);
     // A virtual environment is found from the name of its interpreter.
     PyStatus status = PyConfig_SetBytesString(&config, &config.program_name, python.c_str());
-    if (!PyStatus_Exception(status))
+    if (PyStatus_Exception(status) == 0)
         status = PyConfig_SetBytesArgv(&config, static_cast<Py_ssize_t>(arguments.size()),
                                        const_cast<char* const*>(arguments.data()));
-    if (!PyStatus_Exception(status)) status = Py_InitializeFromConfig(&config);
+    if (PyStatus_Exception(status) == 0) status = Py_InitializeFromConfig(&config);
     PyConfig_Clear(&config);
-    if (PyStatus_Exception(status)) Py_ExitStatusException(status);
+    if (PyStatus_Exception(status) != 0) Py_ExitStatusException(status);
     return Py_RunMain();
 }
 
@@ -68,7 +69,7 @@ int run_python(int argc, char* argv[]) {
 
 PYBIND11_EMBEDDED_MODULE(_tungsten, module) { tungsten_dip::bind(module); }
 
-int main(int argc, char* argv[]) {
+int main(int argc, char** argv) {
     if (needs_python(argc, argv)) return run_python(argc, argv);
     return tungsten_dip::run_stock(argc, const_cast<const char**>(argv));
 }

@@ -153,6 +153,8 @@ struct Render::Impl {
     std::future<void> pass;
     RenderPlan plan;
     std::uint32_t total_spp;
+    // For take_evidence: memory written to for the first time is most of what a hand-over would cost.
+    std::vector<std::vector<float>> means;
 
     [[nodiscard]] Integrator& integrator() const {
         if (!traceable) throw std::runtime_error("this render is over: its buffers were taken");
@@ -206,6 +208,7 @@ Render::Render(const std::string& scene_path, const RenderOptions& options) : im
     const std::uint32_t seed = options.seed.value_or(stock_seed);
     self.traceable.reset(self.scene->makeTraceable(seed));
     self.total_spp = settings.spp();
+    self.means = means_for(*self.scene->camera(), writes_features);
     rapidjson::Document document;
     self.plan = RenderPlan{
         .integrator = self.scene->integrator()->toJson(document.GetAllocator())["type"].GetString(),
@@ -293,7 +296,7 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
     const Vec2u size = scene->camera()->resolution();
     const std::size_t pixels = size.product();
     const BufferBlocks blocks = blocks_of(buffer);
-    auto serialized = std::make_shared<std::stringstream>();
+    const auto serialized = std::make_shared<std::stringstream>();
     OutputStreamHandle out = serialized;
     const std::size_t floats = pixels * sizeof(T) / sizeof(float);
     if (settings.twoBufferVariance()) {
@@ -312,12 +315,15 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
 }
 
 Evidence Render::evidence() const {
-    return evidence_of(*impl_->scene->camera(), current_spp(), impl_->plan.writes_features, false);
+    Camera& camera = *impl_->scene->camera();
+    const bool features = impl_->plan.writes_features;
+    return evidence_of(camera, current_spp(), features, means_for(camera, features), false);
 }
 
 Evidence Render::take_evidence() {
+    Camera& camera = *impl_->scene->camera();
     Evidence evidence =
-        evidence_of(*impl_->scene->camera(), current_spp(), impl_->plan.writes_features, true);
+        evidence_of(camera, current_spp(), impl_->plan.writes_features, std::move(impl_->means), true);
     impl_->traceable.reset();
     impl_->scene.reset();
     return evidence;

@@ -1,6 +1,5 @@
 // One scene rendered by Tungsten, and the evidence in its camera's output buffers. Knows neither Python nor
-// Tungsten: what includes Tungsten's headers is compiled as Tungsten itself was, and meets the rest only
-// here.
+// Tungsten; what includes Tungsten's headers is compiled as Tungsten was, and meets the rest only here.
 #pragma once
 
 #include <chrono>
@@ -101,6 +100,6 @@ class Render {
 const char* tungsten_version();
 
 // The stock command, compiled from the found checkout. Returns 1 where a scene could not be rendered, else 0.
-int run_stock(int argc, const char* argv[]);
+int run_stock(int argc, const char** argv);
 
 }  // namespace tungsten_dip

@@ -10,7 +10,7 @@
 
 namespace tungsten_dip {
 
-int run_stock(int argc, const char* argv[]) {
+int run_stock(int argc, const char** argv) {
     Tungsten::CliParser parser("tungsten", "[options] scene1 [scene2 [scene3...]]");
     Tungsten::StandaloneRenderer renderer(parser, std::cout);
     parser.parse(argc, argv);
