@@ -33,7 +33,7 @@ sys.argv[0] = "tungsten"
 sys.exit(main(sys.argv[1:]))
 )";
 
-bool needs_python(int argc, char** argv) {
+bool needs_python(int argc, const char* const* argv) {
     for (int i = 1; i < argc && std::string_view(argv[i]) != "--"; ++i) {
         const std::string_view argument = argv[i];
         if (argument.starts_with("--dip-") || argument == "--host" || argument.starts_with("--host="))
