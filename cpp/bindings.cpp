@@ -10,6 +10,7 @@
 #include <optional>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include "core.hpp"
 
@@ -147,6 +148,49 @@ py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_
     return py::make_tuple(planes[0], planes[1], planes[2], planes[3]);
 }
 
+Array box_mean_array(const py::array& in, int radius, int threads) {
+    const Image image = image_from_array("image", in);
+    Array out = array_like(image);
+    const Image out_image = image_from_array("out", out);
+    const py::gil_scoped_release release;
+    box_mean(image, radius, out_image, threads);
+    return out;
+}
+
+Array regress_arrays(const py::array& target, const py::array& features, const std::vector<float>& penalty,
+                     const OptionalArray& guide, const OptionalArray& guide_variance, int radius, int step,
+                     int patch_radius, float k, float ridge, int threads) {
+    const Image target_image = image_from_array("target", target);
+    const Image feature_image = image_from_array("features", features);
+    Image guide_image;
+    Image guide_variance_image;
+    if (guide && guide_variance) {
+        guide_image = image_from_array("guide", *guide);
+        guide_variance_image = image_from_array("guide_variance", *guide_variance);
+        if (guide_image.channels != guide_variance_image.channels) {
+            throw py::value_error("guide_variance: expected as many channels as the guide has");
+        }
+    } else if (guide || guide_variance) {
+        throw py::value_error("guide and guide_variance: expected both or neither");
+    }
+    for (const Image& image : {feature_image, guide_image, guide_variance_image}) {
+        if (image.known() && (image.height != target_image.height || image.width != target_image.width)) {
+            throw py::value_error("expected all images in the size of the target");
+        }
+    }
+    if (penalty.size() != static_cast<std::size_t>(feature_image.channels)) {
+        throw py::value_error("penalty: expected one value per feature");
+    }
+    Array out = array_like(target_image);
+    const Image out_image = image_from_array("out", out);
+    const RegressionWindow window{
+        .radius = radius, .step = step, .patch_radius = patch_radius, .k = k, .ridge = ridge};
+    const py::gil_scoped_release release;
+    regress(target_image, feature_image, penalty.data(), guide_image, guide_variance_image, window, out_image,
+            threads);
+    return out;
+}
+
 }  // namespace
 }  // namespace tungsten_dip
 
@@ -176,4 +220,9 @@ PYBIND11_MODULE(_core, module) {
                py::arg("variance"), py::arg("threads") = 0);
     module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),
                py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
+    module.def("box_mean", &box_mean_array, py::arg("image"), py::arg("radius"), py::arg("threads") = 0);
+    module.def("regress", &regress_arrays, py::arg("target"), py::arg("features"), py::arg("penalty"),
+               py::arg("guide") = py::none(), py::arg("guide_variance") = py::none(), py::kw_only(),
+               py::arg("radius"), py::arg("step") = 1, py::arg("patch_radius") = 1, py::arg("k") = 1.0F,
+               py::arg("ridge") = 1e-3F, py::arg("threads") = 0);
 }

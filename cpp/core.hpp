@@ -119,7 +119,28 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
 // `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
-// after filtering. A value whose halves agree and whose variance is 0 is passed through unchanged.
+// after filtering. A value is passed through unchanged where it and the pixels next to it have no noise: their
+// halves agree and their variances are 0.
 void prefilter_feature(const Buffer& in, const Buffer& out, int threads);
+
+// --- regression.cpp
+// -------------------------------------------------------------------------------------------
+
+// How a pixel's neighbours are chosen and weighted in a local regression.
+struct RegressionWindow {
+    int radius = 9;        // pixels to each side
+    int step = 1;          // every step-th pixel of a row and column is looked at
+    int patch_radius = 1;  // the guide is compared in patches of this radius
+    float k = 1;           // how many standard deviations of the guide's noise count as equal
+    float ridge = 1e-3F;   // added to the variance of every feature: keeps flat ones from explaining noise
+};
+
+// Denoises `target` by first-order regression on `features`, fitted anew around every pixel; all predictions
+// that a pixel gets from its neighbours' fits are averaged (Bitterli et al. 2016, section 4; Moon et al.
+// 2014). A neighbour's weight is the non-local means weight of `guide` and its per-pixel `guide_variance`
+// (same shape; without data every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) -
+// feature_c(q))^2). `penalty` has one value per feature. At most 16 features; everything must be finite.
+void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
+             ConstImage guide_variance, const RegressionWindow& window, Image out, int threads);
 
 }  // namespace tungsten_dip

@@ -5,11 +5,10 @@
 // patch.
 #include <algorithm>
 #include <array>
-#include <bit>
-#include <numbers>
 #include <vector>
 
 #include "core.hpp"
+#include "exp_minus.hpp"
 
 namespace tungsten_dip {
 namespace {
@@ -28,20 +27,6 @@ constexpr float largest_distance = 1e4F;
 
 constexpr int tile_size = 64;
 constexpr int padded_size = tile_size + 2 * patch_radius;
-
-// exp(-x) for 0 <= x < 87 to a relative error below 1e-5, then nearly 0: plain arithmetic that compilers
-// vectorise: the whole part of the binary logarithm becomes the exponent's bits, and a polynomial gives
-// 2^fraction.
-inline float exp_minus(float x) {
-    const float log2 = std::max(-std::numbers::log2e_v<float> * x, -126.0F) + 127.0F;
-    const auto whole = static_cast<std::int32_t>(log2);
-    const float f = log2 - static_cast<float>(whole);
-    // Fitted to a relative error below 1e-7.
-    const float mantissa =
-        0.99999994F + f * (0.69315308F +  // NOLINT(modernize-use-std-numbers): fitted, not ln 2
-                           f * (0.24015363F + f * (0.05582631F + f * (0.00898935F + f * 0.00187757F))));
-    return std::bit_cast<float>(static_cast<std::uint32_t>(whole) << 23U) * mantissa;
-}
 
 // An image's channels one after the other: [channel][y][x].
 struct Planes {
@@ -75,8 +60,14 @@ struct Feature {
     Planes b;
     Planes variance;  // of one half
 
+    // A few samples can agree by chance on one side of an edge: a pixel next to a noisy one is noisy, too.
     [[nodiscard]] bool noisy(int c, int y, int x) const {
-        return variance.row(c, y)[x] > 0 || a.row(c, y)[x] != b.row(c, y)[x];
+        for (int v = std::max(y - 1, 0); v <= std::min(y + 1, a.height - 1); ++v) {
+            for (int u = std::max(x - 1, 0); u <= std::min(x + 1, a.width - 1); ++u) {
+                if (variance.row(c, v)[u] > 0 || a.row(c, v)[u] != b.row(c, v)[u]) return true;
+            }
+        }
+        return false;
     }
 };
 

@@ -5,6 +5,8 @@ Inputs are read in place, also read-only ones. The interpreter lock is released 
 ``threads`` 0 uses every core; no result depends on it.
 """
 
+from collections.abc import Sequence
+
 from tungsten_dip.buffers.model import FloatImage
 
 __version__: str
@@ -67,3 +69,27 @@ def prefilter_feature(
     mean: FloatImage, half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0
 ) -> tuple[FloatImage, FloatImage, FloatImage, FloatImage]:
     """Return the cross-filtered (mean, half_a, half_b) of a feature and the variance that remains."""
+
+def box_mean(image: FloatImage, radius: int, threads: int = 0) -> FloatImage:
+    """Return the mean over (2 radius + 1)^2 pixels around every pixel, clipped at the borders."""
+
+def regress(
+    target: FloatImage,
+    features: FloatImage,
+    penalty: Sequence[float],
+    guide: FloatImage | None = None,
+    guide_variance: FloatImage | None = None,
+    *,
+    radius: int,
+    step: int = 1,
+    patch_radius: int = 1,
+    k: float = 1.0,
+    ridge: float = 1e-3,
+    threads: int = 0,
+) -> FloatImage:
+    """Return ``target`` (3 channels) denoised by first-order regression on ``features`` in local windows.
+
+    Neighbours weigh by non-local means of ``guide`` (``guide_variance`` is its noise, same shape), times
+    exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``.
+    At most 16 features; everything must be finite. See ``regress`` in core.hpp.
+    """

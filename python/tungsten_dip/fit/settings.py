@@ -43,7 +43,9 @@ class FitSettings:
             if value is not None and not value > 0:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
         if not self.channels or any(count < 1 for count in self.channels):
-            raise InputError(f"channels: expected positive counts such as 8,16,32,64,128, got {self.channels}")
+            raise InputError(
+                f"channels: expected positive counts such as 8,16,32,64,128, got {self.channels}"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,383 @@
+"""The presets draft, balanced and final: a small network chooses among pilots, trained across the halves.
+
+The network sees one pixel of one half: its features, what the pilots of that half say, and how well each
+pilot predicts the other half in the pixels around it (never in the pixel itself, whose noise it is scored by:
+the blind spot of Krull et al. 2019, "Noise2Void"). It answers with the weights of a mean of the pilots, and
+is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". All this is linear in the
+scored half, so noise adds a constant to the loss and nothing to the image: the mean is kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.statistics import halves_independent
+from tungsten_dip.fit.device import compute_device
+from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit.pilots import (
+    BALANCED_PILOTS,
+    DRAFT_PILOTS,
+    FINAL_PILOTS,
+    Guidance,
+    Pilot,
+    first_pilots,
+    guidance_from_buffers,
+    pilot_images,
+)
+from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.progress import Progress, silent
+
+_LOG = logging.getLogger(__name__)
+
+RELMSE_EPSILON = 0.01
+_TYPICAL_RADIANCE = 0.25
+"""Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
+
+_ONLY_PILOT = Pilot(9, k=1.0)
+"""Used alone where nothing can score the pilots."""
+
+_LOG_OFFSET = 0.02
+_SCORE_RADII = (2, 4, 8)
+_NOISE_RADIUS = 8
+_OUTLIER = 20.0
+"""A squared error this many times the local mean is an outlier: capped where it tells how noisy a place is."""
+
+_LEAST_NOISE = 0.1
+"""Relative variance of one half's pixel below which less noise does not make a pixel count more."""
+
+_HIDDEN = 16
+_BATCH_PIXELS = 1 << 15
+_LEARNING_RATE = 1e-2
+_WARM_UP_STEPS = 10
+_HEAD_START = 1.0
+"""Logit that the best single pilot starts with."""
+
+_CHUNK_PIXELS = 1 << 18
+_HISTORY_EVERY = 20
+_HISTORY_PIXELS = 1 << 16
+_ERROR_RADIUS = 4
+
+
+@dataclass(frozen=True)
+class _Preset:
+    pilots: tuple[Pilot, ...]
+    steps: int
+
+
+_PRESETS = {
+    "draft": _Preset(DRAFT_PILOTS, 80),
+    "balanced": _Preset(BALANCED_PILOTS, 240),
+    "final": _Preset(FINAL_PILOTS, 600),
+}
+
+
+def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress = silent) -> FitResult:
+    """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
+    started = time.perf_counter()
+    threads = settings.threads or 0
+    notes: list[str] = []
+    scale = _exposure(buffers.color.mean)
+    variance = None if buffers.color.variance is None else buffers.color.variance * np.float32(scale**2)
+
+    def scaled(image: FloatImage) -> FloatImage:
+        return image * np.float32(scale)
+
+    missing = [name for name in ("albedo", "normal", "depth") if getattr(buffers, name) is None]
+    if missing:
+        notes.append(f"no {', '.join(missing)}: edges are found with less evidence")
+    guidance = guidance_from_buffers(buffers, threads)
+    progress(0.05, "features")
+
+    color = buffers.color
+    test = halves_independent(buffers, settings.threads)
+    if color.half_a is None or color.half_b is None or not test.independent:
+        notes.append(_why_no_halves(buffers, test))
+        guides, irradiances, noise = first_pilots((scaled(color.mean),), variance, guidance)
+        (image,) = pilot_images(_ONLY_PILOT, irradiances, guides, noise, guidance)
+        seconds = time.perf_counter() - started
+        progress(1.0, "one pilot")
+        return FitResult(
+            color=image / np.float32(scale), settings=settings, seconds=seconds, iterations=0,
+            history=(HistoryPoint(seconds, 0, None),), notes=tuple(notes),
+        )  # fmt: skip
+
+    halves, fireflies = limit_fireflies(scaled(color.half_a), scaled(color.half_b), threads)
+    if fireflies is not None:
+        notes.append(fireflies)
+    fit = _Fit(halves, guidance, settings, started)
+    fit.add_pilots(variance, progress)
+    with compute_device(settings) as device:
+        notes += fit.train(device, progress)
+        image, error, estimate = fit.result(device)
+
+    # The error of the plain mean, by the same evidence.
+    noisy = (halves[0] + halves[1]) / 2
+    noisy_estimate = float(np.mean((halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + RELMSE_EPSILON)))
+    if estimate >= noisy_estimate:
+        notes.append("the input is as good as anything fitted to it, and is returned as it is")
+        image, estimate = scaled(color.mean), noisy_estimate
+        error = _smooth((halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + RELMSE_EPSILON), threads)
+    for note in notes:
+        _LOG.info(note)
+    return FitResult(
+        color=image / np.float32(scale),
+        settings=settings,
+        seconds=time.perf_counter() - started,
+        iterations=fit.steps_done,
+        error=error,
+        estimated_relmse=estimate,
+        history=tuple(fit.history),
+        notes=tuple(notes),
+    )
+
+
+class _Fit:
+    """The pilots of both halves, and the network that chooses among them."""
+
+    def __init__(
+        self, halves: tuple[FloatImage, FloatImage], guidance: Guidance, settings: FitSettings, started: float
+    ) -> None:
+        self.history: list[HistoryPoint] = []
+        self.steps_done = 0
+        self._halves = halves
+        self._guidance = guidance
+        self._settings = settings
+        self._preset = _PRESETS[settings.preset]
+        self._started = started
+        # Per pilot, the images of both halves; the first is the noisy image itself.
+        self._pilots: list[tuple[FloatImage, ...]] = [halves]
+
+    def add_pilots(self, variance: FloatImage | None, progress: Progress) -> None:
+        """Compute the pilots, as many as the time budget lets begin (one at least)."""
+        guides, irradiances, noise = first_pilots(self._halves, variance, self._guidance)
+        for index, pilot in enumerate(self._preset.pilots):
+            progress(0.1 + 0.6 * index / len(self._preset.pilots), f"pilot {index + 1}")
+            if index > 0 and self._seconds() > 0.7 * (self._settings.time_budget_s or math.inf):
+                break
+            self._pilots.append(pilot_images(pilot, irradiances, guides, noise, self._guidance))
+
+    def train(self, device: torch.device, progress: Progress) -> list[str]:
+        """Train the network; return notes. On Ctrl-C it goes on with what is learned."""
+        settings = self._settings
+        self._prepare()
+        generator = torch.Generator().manual_seed(settings.seed)
+        self._network = _network(self._inputs.shape[2], len(self._pilots), generator).to(device)
+        optimizer = torch.optim.Adam(self._network.parameters(), lr=_LEARNING_RATE)
+        steps = settings.iterations or self._preset.steps
+        pixels = self._inputs.shape[1]
+        probe = torch.randperm(pixels, generator=generator)[:_HISTORY_PIXELS]
+        notes: list[str] = []
+        try:
+            for step in range(steps):
+                rate = min(1.0, (step + 1) / _WARM_UP_STEPS) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
+                for group in optimizer.param_groups:
+                    group["lr"] = _LEARNING_RATE * rate
+                batch = torch.randint(2 * pixels, (min(_BATCH_PIXELS, 2 * pixels),), generator=generator)
+                half, pixel = batch // pixels, batch % pixels
+                fused = self._fuse(half, pixel, device)
+                squared = (fused - self._other[half, pixel].to(device)) ** 2
+                loss = (squared * self._weight[half, pixel].to(device)).mean()
+                optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
+                self.steps_done = step + 1
+                if step % _HISTORY_EVERY == 0 or step == steps - 1:
+                    estimate = self._estimate_at(probe, device)
+                    self.history.append(HistoryPoint(self._seconds(), step + 1, estimate))
+                    progress(0.75 + 0.25 * (step + 1) / steps, f"relMSE {estimate:.4g}")
+                    if estimate <= (settings.target_error or -math.inf):
+                        notes.append(f"stopped at step {step + 1}: the target error is reached")
+                        break
+                    if self._seconds() > (settings.time_budget_s or math.inf):
+                        notes.append(f"stopped at step {step + 1}: the time budget is spent")
+                        break
+        except KeyboardInterrupt:
+            notes.append(f"interrupted at step {self.steps_done}: the image is what was reached by then")
+        return notes
+
+    def result(self, device: torch.device) -> tuple[FloatImage, FloatImage, float]:
+        """Return the image, its error per pixel and the mean of that (relMSE)."""
+        shape = self._halves[0].shape
+        fused = [self._fuse_all(half, device).reshape(shape) for half in (0, 1)]
+        image = (fused[0] + fused[1]) / 2
+        unbiased = _squared_error(*self._halves, *fused) / (image**2 + RELMSE_EPSILON)
+        estimate = max(float(unbiased.mean()), 0.0)
+        # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and the
+        # halves' difference, which has little noise, is the least that it can be.
+        spread = (fused[0] - fused[1]) ** 2 / 4 / (image**2 + RELMSE_EPSILON)
+        threads = self._guidance.threads
+        error = np.maximum(_smooth(unbiased, threads), _smooth(spread, threads))
+        return image, error, estimate
+
+    def _prepare(self) -> None:
+        """Build what the network sees, flattened to shape (half, pixel, ...)."""
+        threads = self._guidance.threads
+        pixels = self._halves[0].shape[0] * self._halves[0].shape[1]
+        count = len(self._pilots)
+        self._choices = torch.empty(2, pixels, count, 3)
+        for index, pilot in enumerate(self._pilots):
+            for half in (0, 1):
+                self._choices[half, :, index] = torch.from_numpy(pilot[half]).reshape(pixels, 3)
+        self._other = torch.stack([torch.from_numpy(h).reshape(pixels, 3) for h in self._halves[::-1]])
+
+        # Relative to what the half itself says, never to the half that scores it: a pixel must not count less
+        # because the noise that it is compared with is bright, or the image would darken.
+        smooth = self._pilots[-1]
+        denominators = [
+            image.mean(axis=2, keepdims=True) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth
+        ]
+        errors = [
+            [_error(*images) for images in zip(pilot, self._halves[::-1], denominators, strict=True)]
+            for pilot in self._pilots
+        ]
+        mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
+        self._best = 1 + int(np.argmin(mean_errors))
+
+        weights = [
+            1
+            / (
+                denominators[half]
+                * (
+                    _LEAST_NOISE
+                    + _mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
+                )
+            )
+            for half in (0, 1)
+        ]
+        self._weight = torch.from_numpy(np.stack(weights).astype(np.float32)).reshape(2, pixels, 1)
+
+        per_half = []
+        for half in (0, 1):
+            noise = _mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
+            cap = _OUTLIER * noise + np.float32(1e-3)
+            reference = np.minimum(errors[self._best][half], cap)
+            columns = [self._guidance.features, np.log(noise + np.float32(1e-4))]
+            base = _log_level(self._pilots[self._best][half])
+            columns.append(base)
+            for index, pilot in enumerate(self._pilots):
+                if index == self._best:
+                    continue
+                columns.append(np.clip(_log_level(pilot[half]) - base, -2, 2))
+                worse = np.minimum(errors[index][half], cap) - reference
+                for radius in _SCORE_RADII:
+                    score = _mean_around(worse, radius, threads) / (
+                        np.float32(0.05) * noise + np.float32(1e-4)
+                    )
+                    columns.append(np.clip(score, -3, 3))
+            per_half.append(np.concatenate(columns, axis=2).reshape(pixels, -1))
+        inputs = torch.from_numpy(np.stack(per_half))
+        mean = inputs.mean((0, 1))
+        spread = inputs.std((0, 1), correction=0)
+        varying = spread > 1e-6
+        self._inputs = ((inputs[..., varying] - mean[varying]) / spread[varying]).clamp(-4, 4)
+
+    def _fuse(self, half: Tensor | int, pixel: Tensor | slice, device: torch.device) -> Tensor:
+        logits = self._network(self._inputs[half, pixel].to(device))
+        logits[:, self._best] += _HEAD_START
+        return (logits.softmax(1)[..., None] * self._choices[half, pixel].to(device)).sum(1)
+
+    @torch.no_grad()
+    def _fuse_all(self, half: int, device: torch.device) -> FloatImage:
+        pixels = self._inputs.shape[1]
+        parts = [
+            self._fuse(half, slice(first, first + _CHUNK_PIXELS), device).cpu()
+            for first in range(0, pixels, _CHUNK_PIXELS)
+        ]
+        return torch.cat(parts).numpy()
+
+    @torch.no_grad()
+    def _estimate_at(self, pixel: Tensor, device: torch.device) -> float:
+        fused = [self._fuse(half, pixel, device).cpu().numpy() for half in (0, 1)]
+        halves = [self._other[1 - half, pixel].numpy() for half in (0, 1)]
+        image = (fused[0] + fused[1]) / 2
+        error = _squared_error(halves[0], halves[1], fused[0], fused[1]) / (image**2 + RELMSE_EPSILON)
+        return max(float(error.mean()), 0.0)
+
+    def _seconds(self) -> float:
+        return time.perf_counter() - self._started
+
+
+def _network(inputs: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+    network = nn.Sequential(
+        nn.Linear(inputs, _HIDDEN),
+        nn.LeakyReLU(0.2),
+        nn.Linear(_HIDDEN, _HIDDEN),
+        nn.LeakyReLU(0.2),
+        nn.Linear(_HIDDEN, outputs),
+    )
+    for parameter in network.parameters():
+        if parameter.ndim == 2:
+            nn.init.kaiming_uniform_(parameter, a=0.2, generator=generator)
+        else:
+            nn.init.zeros_(parameter)
+    # Starts from the mean of the pilots that the head start gives, whatever the seed.
+    nn.init.zeros_(network[-1].weight)  # type: ignore[arg-type]
+    return network
+
+
+Array = npt.NDArray[np.float32]
+
+
+def _squared_error(half_a: Array, half_b: Array, fused_a: Array, fused_b: Array) -> Array:
+    """Estimate the squared error of (fused_a + fused_b) / 2 without bias, in every pixel and colour.
+
+    With independent halves a, b of truth x and outputs f made of one half each, E (f_a - b)^2 is the error of
+    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of f; the mean
+    of two outputs has half of that variance.
+    """
+    crossed = (fused_a - half_b) ** 2 + (fused_b - half_a) ** 2
+    return (crossed - (half_a - half_b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
+
+
+def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
+    return ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
+
+
+def _smooth(error: FloatImage, threads: int) -> FloatImage:
+    mean = np.ascontiguousarray(error.mean(axis=2, keepdims=True), np.float32)
+    return np.maximum(_core.box_mean(mean, _ERROR_RADIUS, threads), 0)
+
+
+def _capped(error: FloatImage, threads: int) -> FloatImage:
+    return np.minimum(error, np.float32(_OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads))
+
+
+def _mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
+    """The local mean without the pixel itself (0 where there is no other)."""
+    height, width = image.shape[:2]
+    rows, columns = (
+        np.minimum(np.arange(n) + radius, n - 1) - np.maximum(np.arange(n) - radius, 0) + 1
+        for n in (height, width)
+    )
+    count = np.outer(rows, columns).astype(np.float32)[..., None]
+    return (_core.box_mean(image, radius, threads) * count - image) / np.maximum(count - 1, 1)
+
+
+def _log_level(image: FloatImage) -> FloatImage:
+    return np.log(image.mean(axis=2, keepdims=True) + np.float32(_LOG_OFFSET))
+
+
+def _exposure(color: FloatImage) -> float:
+    """The power of two that brings the median of the lit pixels near the typical radiance (exact to undo)."""
+    level = color.mean(axis=2, dtype=np.float64)
+    lit = level[level > 0]
+    if lit.size == 0:
+        return 1.0
+    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
+
+
+def _why_no_halves(buffers: RenderBuffers, test: _core.HalvesTest) -> str:
+    tail = "nothing can score the result: one pilot is used, without an estimate of its error"
+    if not buffers.color.has_halves:
+        return f"no half buffers: {tail}"
+    return f"the half buffers are not independent (correlation {test.correlation:.2f}): {tail}"

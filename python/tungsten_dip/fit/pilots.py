@@ -1,0 +1,195 @@
+"""Pilots: closed-form guesses at the clean image, among which a network later chooses pixel by pixel.
+
+Every pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
+window of its own. Each half of the samples is denoised from its own samples alone: what one half's pilots
+predict is scored by the other half, whose noise they have never seen.
+"""
+
+from __future__ import annotations
+
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.prefilter import prefilter_features
+
+# Features are scaled so that one unit is a difference which separates two surfaces; these penalties of squared
+# differences stand for normals 35 degrees apart, albedos 0.2 apart and depths a tenth of the scene's apart.
+_NORMAL_PENALTY = 3.0
+_ALBEDO_PENALTY = 20.0
+_DEPTH_PENALTY = 5.0
+_DEPTH_SCALE = 3.0
+_POSITION_SCALE_PIXELS = 20.0
+
+_LEAST_ALBEDO = 0.01
+"""Added to the albedo that divides the colour, so that dark surfaces keep their noise finite."""
+
+_BLACK_ALBEDO = 1e-3
+"""Below it a surface's colour cannot come from its albedo (a specular one, say) and is not divided by it."""
+
+_GUIDE_OFFSET = 0.05
+"""Guides are compared as log(radiance + offset); the offset is where the eye stops to see noise as relative."""
+
+_GUIDE_NOISE_RADIUS = 3
+_LEAST_GUIDE_VARIANCE = 1e-5
+
+_SAMPLES_OF_FIRST_WINDOW = 12
+"""About how many independent neighbours the 7x7 window of the first guide averages, used without halves."""
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """One window of regression. ``k`` None: neighbours are weighed by features alone, not by a guide."""
+
+    radius: int
+    k: float | None = None
+    step: int = 1
+    with_position: bool = False
+
+
+FIRST_GUIDE = Pilot(radius=3)
+
+# In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
+# shadows and reflections, which no feature shows; a regression on the position follows gradients.
+DRAFT_PILOTS = (Pilot(1), Pilot(5), Pilot(5, k=1.0))
+BALANCED_PILOTS = (
+    Pilot(1),
+    Pilot(5),
+    Pilot(12, step=2, with_position=True),
+    Pilot(4, k=1.0),
+    Pilot(9, k=1.0),
+    Pilot(9, k=2.0, with_position=True),
+    Pilot(18, k=1.5, step=2, with_position=True),
+)
+FINAL_PILOTS = (*BALANCED_PILOTS, Pilot(2, k=1.0), Pilot(9, k=0.5), Pilot(9, k=1.0, with_position=True))
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """What all pilots share: features to regress on and the albedo that divides the colour.
+
+    ``features`` has shape (height, width, n), noise-reduced, scaled, without those that are the same in
+    every pixel; ``penalty`` one value for each. ``albedo`` has shape (height, width, 3), never 0.
+    """
+
+    features: FloatImage
+    penalty: tuple[float, ...]
+    albedo: FloatImage
+    threads: int
+
+
+def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
+    """Pre-filter, scale and select the features of sanitised buffers."""
+    filtered = prefilter_features(buffers, threads)
+    shape = buffers.color.mean.shape
+    scaled: list[tuple[FloatImage, float]] = []
+    albedo = np.ones(shape, np.float32)
+    if filtered.albedo is not None:
+        mean = filtered.albedo.mean
+        scaled.append((np.clip(mean, 0, 1), _ALBEDO_PENALTY))
+        black = mean.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
+        albedo = np.where(black, np.float32(1), np.maximum(mean, 0) + np.float32(_LEAST_ALBEDO))
+    if filtered.normal is not None:
+        scaled.append((np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
+    if filtered.depth is not None:
+        depth = filtered.depth.mean
+        hit = depth[depth > 0]
+        # Bounded for any unit of length; near and far surfaces stay apart.
+        typical = np.float32(np.median(hit)) if hit.size else np.float32(1)
+        scaled.append((np.float32(_DEPTH_SCALE) * depth / (depth + typical), _DEPTH_PENALTY))
+    planes = [
+        (image[:, :, channel], penalty)
+        for image, penalty in scaled
+        for channel in range(image.shape[2])
+        if image[:, :, channel].size and np.ptp(image[:, :, channel]) > 0
+    ]
+    features = (
+        np.stack([plane for plane, _ in planes], axis=2) if planes else np.empty((*shape[:2], 0), np.float32)
+    )
+    return Guidance(features, tuple(penalty for _, penalty in planes), albedo, threads)
+
+
+def first_pilots(
+    colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: Guidance
+) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, ...], FloatImage]:
+    """Return (guides, demodulated colours, guide variance) for the guided pilots.
+
+    ``colors`` are the two halves, or the mean alone where there are no halves that can be trusted; then
+    ``variance`` (of the mean, same shape) says how noisy it is, and its own residual does where it is None.
+    """
+    irradiances = tuple(color / guidance.albedo for color in colors)
+    guides = tuple(np.maximum(_regress(image, FIRST_GUIDE, guidance), 0) for image in irradiances)
+    guides, noise = _guides(guides, irradiances, variance, guidance)
+    second = Pilot(radius=7, k=1.0)
+    guides = tuple(
+        np.maximum(_regress(image, second, guidance, guide, noise), 0)
+        for image, guide in zip(irradiances, guides, strict=True)
+    )
+    guides, noise = _guides(guides, irradiances, variance, guidance)
+    return guides, irradiances, noise
+
+
+def pilot_images(
+    pilot: Pilot,
+    irradiances: tuple[FloatImage, ...],
+    guides: tuple[FloatImage, ...],
+    guide_variance: FloatImage,
+    guidance: Guidance,
+) -> tuple[FloatImage, ...]:
+    """Denoise every half by one pilot; return linear radiance, shape (height, width, 3), never negative."""
+    return tuple(
+        np.maximum(_regress(image, pilot, guidance, guide, guide_variance), 0) * guidance.albedo
+        for image, guide in zip(irradiances, guides, strict=True)
+    )
+
+
+def _guides(
+    images: tuple[FloatImage, ...],
+    irradiances: tuple[FloatImage, ...],
+    variance: FloatImage | None,
+    guidance: Guidance,
+) -> tuple[tuple[FloatImage, ...], FloatImage]:
+    guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
+    if len(guides) == 2:
+        noise = (guides[0] - guides[1]) ** 2 / 2
+    else:
+        squared = variance / guidance.albedo**2 if variance is not None else (irradiances[0] - images[0]) ** 2
+        noise = squared / (_SAMPLES_OF_FIRST_WINDOW * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
+    noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, guidance.threads)
+    return guides, noise + np.float32(_LEAST_GUIDE_VARIANCE)
+
+
+def _regress(
+    image: FloatImage,
+    pilot: Pilot,
+    guidance: Guidance,
+    guide: FloatImage | None = None,
+    guide_variance: FloatImage | None = None,
+) -> FloatImage:
+    features, penalty = guidance.features, guidance.penalty
+    if pilot.with_position:
+        features = np.concatenate((features, _positions(image.shape)), axis=2)
+        penalty = (*penalty, 0.0, 0.0)
+    if pilot.k is None:
+        return _core.regress(
+            image, features, penalty, radius=pilot.radius, step=pilot.step, threads=guidance.threads
+        )
+    return _core.regress(
+        image,
+        features,
+        (0.0,) * len(penalty),
+        guide,
+        guide_variance,
+        radius=pilot.radius,
+        step=pilot.step,
+        k=pilot.k,
+        threads=guidance.threads,
+    )
+
+
+def _positions(shape: tuple[int, ...]) -> FloatImage:
+    rows, columns = np.indices(shape[:2], dtype=np.float32) / np.float32(_POSITION_SCALE_PIXELS)
+    return np.stack((columns, rows), axis=2)
