@@ -56,7 +56,6 @@ enum class Quantity : std::uint8_t { color, albedo, normal, depth, visibility };
 void parallel_for(int count, int threads, const std::function<void(int)>& body);
 
 // --- sanitize.cpp
-// ---------------------------------------------------------------------------------------------
 
 // How many values of an image cannot be meant. A depth of 1e9 and more counts as infinite: renderers mark the
 // sky so (Blender 1e10, Arnold 1e30). Normals may be negative; no other quantity and no variance may.
@@ -88,7 +87,6 @@ BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads)
 void mend(const Buffer& buffer, Quantity quantity);
 
 // --- statistics.cpp
-// -------------------------------------------------------------------------------------------
 
 // (half_a - half_b)^2 / 4: an unbiased, very noisy estimate of the variance of the mean of independent
 // halves.
@@ -114,17 +112,15 @@ struct HalvesTest {
 HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads);
 
 // --- prefilter.cpp
-// --------------------------------------------------------------------------------------------
 
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
 // `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
-// after filtering. A value is passed through unchanged where it and the pixels next to it have no noise: their
-// halves agree and their variances are 0.
+// after filtering. A value is passed through unchanged where it and the pixels next to it have no noise:
+// their halves agree and their variances are 0.
 void prefilter_feature(const Buffer& in, const Buffer& out, int threads);
 
 // --- regression.cpp
-// -------------------------------------------------------------------------------------------
 
 // How a pixel's neighbours are chosen and weighted in a local regression.
 struct RegressionWindow {

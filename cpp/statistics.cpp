@@ -3,6 +3,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <stdexcept>
 #include <vector>
 
 #include "core.hpp"
@@ -193,6 +194,7 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 }
 
 void box_mean(ConstImage in, int radius, Image out, int threads) {
+    if (radius < 0) throw std::invalid_argument("the radius must not be negative");
     const auto first = [radius](int i) { return std::max(i - radius, 0); };
     const auto last = [radius](int i, int size) { return std::min(i + radius, size - 1); };
 

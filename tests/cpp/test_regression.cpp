@@ -1,0 +1,149 @@
+// The local regression: what it must leave alone, how much noise it takes away, and sizes that are no
+// multiple of its tiles. (test_regression.py compares it with a plain implementation.)
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <random>
+#include <stdexcept>
+#include <vector>
+
+#include "check.hpp"
+#include "core.hpp"
+#include "pixels.hpp"
+
+using namespace tungsten_dip;
+
+namespace {
+
+struct Size {
+    int height, width;
+};
+// Around one tile of 8x64 pixels, and far from it.
+constexpr std::array sizes{Size{1, 1}, Size{1, 65}, Size{9, 1}, Size{7, 5}, Size{8, 64}, Size{9, 130}};
+
+Pixels noise(Size size, int channels, unsigned seed, double sigma = 1) {
+    std::mt19937 generator(seed);  // NOLINT(misc-const-correctness): the distribution changes it
+    std::normal_distribution<double> normal(0, sigma);
+    Pixels image(size.height, size.width, channels);
+    for (float& value : image.values) value = static_cast<float>(normal(generator));
+    return image;
+}
+
+Pixels regressed(Pixels& target, Pixels& features, const RegressionWindow& window, int threads = 2) {
+    const std::vector<float> penalty(static_cast<std::size_t>(features.channels), 0.1F);
+    Pixels out(target.height, target.width, 3, -1.0F);
+    regress(target.view(), features.view(), penalty.data(), {}, {}, window, out.view(), threads);
+    return out;
+}
+
+Pixels regressed(Pixels& target, Pixels& features, Pixels& guide, Pixels& guide_variance,
+                 const RegressionWindow& window, int threads = 2) {
+    const std::vector<float> penalty(static_cast<std::size_t>(features.channels), 0.0F);
+    Pixels out(target.height, target.width, 3, -1.0F);
+    regress(target.view(), features.view(), penalty.data(), guide.view(), guide_variance.view(), window,
+            out.view(), threads);
+    return out;
+}
+
+double largest_difference(const Pixels& a, const Pixels& b) {
+    double largest = 0;
+    for (std::size_t i = 0; i < a.values.size(); ++i)
+        largest = std::max(largest, std::abs(static_cast<double>(a.values[i]) - b.values[i]));
+    return largest;
+}
+
+void linear_colors_stay() {
+    for (const Size size : sizes) {
+        Pixels features = noise(size, 2, 1);
+        Pixels target(size.height, size.width, 3);
+        for (int y = 0; y < size.height; ++y) {
+            for (int x = 0; x < size.width; ++x) {
+                const float f = features.at(y, x, 0);
+                const float g = features.at(y, x, 1);
+                target.at(y, x, 0) = 1 + 2 * f;
+                target.at(y, x, 1) = 3 - f + 0.5F * g;
+                target.at(y, x, 2) = 4;
+            }
+        }
+        const RegressionWindow window{.radius = 6, .step = 2, .ridge = 1e-8F};
+        CHECK(largest_difference(regressed(target, features, window), target) < 1e-3);
+        Pixels guide = noise(size, 3, 2);
+        Pixels variance(size.height, size.width, 3, 0.5F);
+        CHECK(largest_difference(regressed(target, features, guide, variance, window), target) < 1e-3);
+    }
+}
+
+void constants_stay() {
+    for (const Size size : sizes) {
+        for (const int radius : {0, 1, 40}) {
+            Pixels target(size.height, size.width, 3, 0.7F);
+            Pixels features = noise(size, 16, 3);
+            CHECK(largest_difference(regressed(target, features, {.radius = radius}), target) < 1e-4);
+        }
+    }
+}
+
+void noise_falls_by_the_size_of_the_window() {
+    Pixels target = noise({.height = 96, .width = 110}, 3, 4);
+    Pixels features(96, 110, 0);
+    const Pixels out = regressed(target, features, {.radius = 2});
+    double squares = 0;
+    for (const float value : out.values) squares += static_cast<double>(value) * value;
+    // A mean over 5 taps of a mean over 5 taps is the triangle 1 2 3 4 5 4 3 2 1 over 25, in both directions.
+    const double expected = std::pow(85.0 / 625, 2);
+    CHECK(near(squares / static_cast<double>(out.values.size()), expected, 0.2 * expected));
+}
+
+void threads_do_not_change_the_bits() {
+    const Size size{.height = 35, .width = 71};
+    Pixels target = noise(size, 3, 5);
+    Pixels features = noise(size, 5, 6);
+    Pixels guide = noise(size, 3, 7);
+    Pixels variance(size.height, size.width, 3, 0.3F);
+    const RegressionWindow window{.radius = 4, .patch_radius = 2};
+    const Pixels one = regressed(target, features, guide, variance, window, 1);
+    CHECK(one == regressed(target, features, guide, variance, window, 5));
+    CHECK(one == regressed(target, features, guide, variance, window, 0));
+}
+
+void nothing_is_done_to_nothing() {
+    for (const Size size : {Size{.height = 0, .width = 4}, Size{.height = 4, .width = 0}}) {
+        Pixels target(size.height, size.width, 3);
+        Pixels features(size.height, size.width, 2);
+        CHECK(regressed(target, features, {.radius = 3}).values.empty());
+    }
+}
+
+bool refused(int target_channels, int features, const RegressionWindow& window) {
+    Pixels target(3, 4, target_channels);
+    Pixels feature_image(3, 4, features);
+    try {
+        regressed(target, feature_image, window);
+    } catch (const std::invalid_argument&) {
+        return true;
+    }
+    return false;
+}
+
+void what_cannot_be_is_refused() {
+    CHECK(!refused(3, 16, {.radius = 4, .step = 2}));
+    CHECK(refused(3, 17, {}));
+    CHECK(refused(1, 2, {}));
+    CHECK(refused(3, 2, {.radius = 3, .step = 2}));
+    CHECK(refused(3, 2, {.radius = -1}));
+    CHECK(refused(3, 2, {.step = 0}));
+    CHECK(refused(3, 2, {.patch_radius = -1}));
+}
+
+}  // namespace
+
+int main() {
+    linear_colors_stay();
+    constants_stay();
+    noise_falls_by_the_size_of_the_window();
+    threads_do_not_change_the_bits();
+    nothing_is_done_to_nothing();
+    what_cannot_be_is_refused();
+    return failed_checks();
+}
