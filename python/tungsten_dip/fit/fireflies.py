@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip import _core
 from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8
 _LIMIT = 30.0
 """How many times brighter than its surroundings a pixel may be that only one half of the samples shows so."""
+
+_ROUNDS = 40
+_SETTLED = 0.9
+"""Surroundings are known well enough once a round lowers no pixel below this part of itself."""
+
+_BRIGHTEST = 1e30
+"""Sums of brighter pixels overflow."""
 
 
 def limit_fireflies(
@@ -20,22 +27,30 @@ def limit_fireflies(
     What is bright in both halves is left alone, whatever its radiance, and so is everything up to 30 times the
     mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if anything.
     """
-    levels = [half.mean(axis=2, keepdims=True) for half in (half_a, half_b)]
-    # A firefly must not raise its own limit nor, much, that of the pixels around it.
-    count = (2 * _RADIUS + 1) ** 2
-    mean = _core.box_mean((levels[0] + levels[1]) / 2, _RADIUS, threads)
-    mean = _core.box_mean(np.minimum((levels[0] + levels[1]) / 2, _LIMIT * mean), _RADIUS, threads)
+    levels = [half.mean(axis=2, keepdims=True, dtype=np.float64) for half in (half_a, half_b)]
+    around = _surroundings((levels[0] + levels[1]) / 2, threads)
     limited, taken, pixels = [], 0.0, 0
     for half, level, other in zip((half_a, half_b), levels, levels[::-1], strict=True):
-        around = np.maximum(mean - np.minimum(level / 2, _LIMIT * mean) / np.float32(count), 0)
-        limit = np.float32(_LIMIT) * np.maximum(around, other)
-        over = (level > limit) & (level > 0)
-        factor = np.where(over, limit / np.where(over, level, 1), 1).astype(np.float32)
-        limited.append(half * factor)
+        limit = _LIMIT * np.maximum(around, other)
+        over = level > limit
+        factor = np.where(over, limit / np.where(over, level, 1), 1)
+        limited.append(half * factor.astype(np.float32))
         pixels += int(over.sum())
-        taken += float((level - level * factor).sum(dtype=np.float64))
+        taken += float((level - level * factor).sum())
     if pixels == 0:
         return (half_a, half_b), None
-    total = sum(float(level.sum(dtype=np.float64)) for level in levels)
+    total = float(levels[0].sum() + levels[1].sum())
     note = f"{pixels} fireflies limited, with {100 * taken / total:.2g}% of the image's energy"
     return (limited[0], limited[1]), note
+
+
+def _surroundings(level: np.ndarray[tuple[int, ...], np.dtype[np.float64]], threads: int) -> FloatImage:
+    """Return the mean around every pixel, to which no other pixel adds more than `_LIMIT` times its own."""
+    capped = np.minimum(level, _BRIGHTEST).astype(np.float32)
+    for _ in range(_ROUNDS):
+        around = np.maximum(mean_around(capped, _RADIUS, threads), 0)
+        lower = np.minimum(capped, np.float32(_LIMIT) * around)
+        if (lower >= np.float32(_SETTLED) * capped).all():
+            break
+        capped = lower
+    return around

@@ -1,0 +1,89 @@
+"""Fireflies: what one half alone shows is limited, what both show and what is smooth is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tungsten_dip.buffers import FloatImage
+from tungsten_dip.fit.fireflies import limit_fireflies
+
+
+def _halves(height: int = 24, width: int = 31) -> tuple[FloatImage, FloatImage]:
+    """Two noisy halves of a smooth gradient of about radiance 1."""
+    rng = np.random.default_rng(0)
+    truth = np.linspace(0.5, 1.5, width)[None, :, None] * np.ones((height, width, 3))
+    half_a, half_b = (truth * rng.gamma(4, 1 / 4, truth.shape) for _ in range(2))
+    return half_a.astype(np.float32), half_b.astype(np.float32)
+
+
+@pytest.mark.parametrize("half", [0, 1])
+@pytest.mark.parametrize("radiance", [1e4, 1e6, 1e12, 1e20, 1e30])
+@pytest.mark.parametrize("at", [(12, 15), (0, 0), (23, 30)])
+def test_a_firefly_of_one_half_is_limited(half: int, radiance: float, at: tuple[int, int]) -> None:
+    halves = _halves()
+    halves[half][at] = radiance * np.array([1, 0.5, 0.25], np.float32)
+    limited, note = limit_fireflies(*halves, 1)
+    assert note is not None
+    assert note.startswith("1 fireflies limited")
+    # 30 times what is around it, give or take the noise of that.
+    level = limited[half][at].mean()
+    assert 10 < level < 60
+    np.testing.assert_allclose(limited[half][at] / limited[half][at][0], [1, 0.5, 0.25], rtol=1e-5)
+    others = np.ones(halves[0].shape[:2], bool)
+    others[at] = False
+    np.testing.assert_array_equal(limited[half][others], halves[half][others])
+    np.testing.assert_array_equal(limited[1 - half], halves[1 - half])
+
+
+def test_fireflies_side_by_side_do_not_support_one_another() -> None:
+    halves = _halves()
+    for at, radiance in (((10, 10), 1e5), ((10, 11), 1e8), ((11, 12), 1e20)):
+        halves[0][at] = radiance
+    limited, note = limit_fireflies(*halves, 2)
+    assert note is not None
+    assert limited[0].max() < 200
+
+
+@pytest.mark.parametrize("radiance", [1e3, 1e8, 1e30])
+def test_a_light_that_both_halves_show_is_left_alone(radiance: float) -> None:
+    halves = _halves()
+    halves[0][5, 6], halves[1][5, 6] = radiance, 0.8 * radiance
+    limited, note = limit_fireflies(*halves, 1)
+    assert note is None
+    for before, after in zip(halves, limited, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 5), (24, 31)])
+def test_images_without_fireflies_keep_every_bit(size: tuple[int, int]) -> None:
+    for halves in (_halves(*size), (np.zeros((*size, 3), np.float32),) * 2):
+        limited, note = limit_fireflies(*halves, 1)
+        assert note is None
+        for before, after in zip(halves, limited, strict=True):
+            assert before.tobytes() == after.tobytes()
+
+
+def test_a_lone_pixel_is_bounded_by_the_other_half() -> None:
+    dim, bright = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 1e9, np.float32)
+    limited, note = limit_fireflies(dim, bright, 1)
+    assert note is not None
+    np.testing.assert_array_equal(limited[0], dim)
+    np.testing.assert_allclose(limited[1], 15, rtol=1e-5)
+
+
+def test_a_firefly_before_black_stays_finite() -> None:
+    halves = np.zeros((9, 9, 3), np.float32), np.zeros((9, 9, 3), np.float32)
+    halves[0][4, 4] = 1e30
+    limited, _ = limit_fireflies(*halves, 1)
+    assert all(np.isfinite(half).all() for half in limited)
+    assert limited[0].max() < 1e30
+    assert limited[0].min() == 0
+
+
+def test_limits_scale_with_the_exposure() -> None:
+    halves = _halves()
+    halves[0][3, 4] = 1e7
+    scaled, _ = limit_fireflies(*(half * np.float32(2**-6) for half in halves), 1)
+    for plain, small in zip(limit_fireflies(*halves, 1)[0], scaled, strict=True):
+        np.testing.assert_array_equal(plain * np.float32(2**-6), small)
