@@ -24,8 +24,9 @@ def limit_fireflies(
 ) -> tuple[tuple[FloatImage, FloatImage], str | None]:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    What is bright in both halves is left alone, whatever its radiance, and so is everything up to 30 times the
-    mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if anything.
+    What is bright in both halves is left alone, whatever its radiance, and so is everything up to 30 times
+    the mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if
+    anything.
     """
     levels = [half.mean(axis=2, keepdims=True, dtype=np.float64) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)

@@ -16,4 +16,4 @@ def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
     )
     count = np.outer(rows, columns).astype(np.float32)[..., None]
     others: FloatImage = _core.box_mean(image, radius, threads) * count - image
-    return others / np.maximum(count - 1, 1)
+    return others / np.maximum(count - 1, np.float32(1))
