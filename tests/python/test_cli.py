@@ -113,14 +113,14 @@ def renders(monkeypatch, make_render):
 
 
 def fails(capfd, status, *words):
-    """Assert that exactly one line was said, that it holds the words, and that stdout stayed empty."""
+    """Assert that the command ended with one line that holds the words, and that stdout stayed empty."""
     out, err = capfd.readouterr()
     assert status == 2
     assert out == ""
-    lines = [line for line in err.splitlines() if line.startswith(("tungsten-dip: ", "tungsten: "))]
-    assert lines, err
     assert "Traceback" not in err
-    assert all(str(word) in lines[-1] for word in words), lines[-1]
+    last = err.splitlines()[-1]
+    assert last.startswith(("tungsten-dip: ", "tungsten: "))
+    assert all(str(word) in last for word in words), last
 
 
 # --- tungsten-dip denoise ---------------------------------------------------------------------------
@@ -209,7 +209,13 @@ def emptied(folder):
     return folder
 
 
-@pytest.mark.parametrize("spoil", [truncated, of_another_size, without_color, emptied])
+def without_bytes(folder):
+    path = folder / "normalA.exr"
+    path.write_bytes(b"")
+    return path
+
+
+@pytest.mark.parametrize("spoil", [truncated, of_another_size, without_color, emptied, without_bytes])
 def test_bad_buffers(spoil, folder, tmp_path, fits, capfd):
     culprit = spoil(folder)
     out = tmp_path / "out.exr"
@@ -222,25 +228,34 @@ def test_bad_buffers(spoil, folder, tmp_path, fits, capfd):
     ("arguments", "words"),
     [
         ("{folder}x -o {tmp}/out.exr", ["{folder}x", "no such file"]),
+        ("{tmp}/picture.png -o {tmp}/out.exr", ["{tmp}/picture.png", ".exr"]),
+        ("{tmp}/scene.json -o {tmp}/out.exr", ["{tmp}/scene.json", "n.exr", "render the scene first"]),
         ("{folder} -o {tmp}/none/out.exr", ["{tmp}/none/out.exr", "cannot be written"]),
         ("{folder} -o {tmp}", ["{tmp}"]),
+        ("{folder} -o {tmp}/folder.exr", ["{tmp}/folder.exr", "this is a folder"]),
         ("{folder} -o {tmp}/out.png", ["{tmp}/out.png", ".exr"]),
         ("{folder} -o {tmp}/out.exr --report {tmp}/none/r.html", ["{tmp}/none/r.html"]),
         ("{folder} -o {tmp}/out.exr --error-map {tmp}/none/e.exr", ["{tmp}/none/e.exr"]),
         ("{folder} -o {tmp}/out.exr --time-budget soon", ["--time-budget", "90s", "soon"]),
+        ("{folder} -o {tmp}/out.exr --error-map {tmp}/out.exr", ["{tmp}/out.exr", "two files"]),
         ("{folder} -o {tmp}/out.exr --time-budget 0", ["time_budget_s"]),
+        ("{folder} -o {tmp}/out.exr --time-budget=-5s", ["--time-budget", "90s", "-5s"]),
         ("{folder} -o {tmp}/out.exr --iterations -1", ["iterations"]),
         ("{folder} -o {tmp}/out.exr --target-error nan", ["target_error"]),
         ("{folder} -o {tmp}/out.exr --network resnet", ["--network", "--preset paper"]),
         ("{folder} -o {tmp}/out.exr --preset paper --channels 8,x", ["--channels", "8,16"]),
         ("{folder} -o {tmp}/out.exr --map color", ["--map", "NAME=CHANNEL"]),
         ("{folder} -o {tmp}/out.exr --map beauty=x", ["beauty"]),
+        ("{folder} -o {tmp}/out.exr --map color=main", ["color=main", "{folder}", "colorA.exr"]),
+        ("{folder}/color.exr -o {tmp}/out.exr --map normal=N", ["normal=N", "color.exr", "R, G, B"]),
         ("{folder} -o {tmp}/out.exr --prese draft", ["--prese"]),
         ("{folder}", ["-o/--output"]),
         ("", ["INPUT"]),
     ],
 )
-def test_bad_arguments(arguments, words, folder, tmp_path, fits, capfd):
+def test_bad_arguments(arguments, words, folder, scene, tmp_path, fits, capfd):
+    (tmp_path / "folder.exr").mkdir()
+    write_image(tmp_path / "picture.png", np.zeros((2, 3, 3)))
     places = {"folder": folder, "tmp": tmp_path}
     before = sorted(tmp_path.rglob("*"))
     status = command.main(["denoise", *arguments.format(**places).split()])
@@ -280,7 +295,11 @@ def test_inspect_buffers(folder, capfd):
     [
         ("{", ["not JSON"]),
         ('{"primitives": [{"type": "quad", "bsdf": {"type": "velvet"}}]}', ["velvet"]),
+        ('{"primitives": [{"type": "mesh", "file": "gone.obj", "bsdf": {"type": "lambert"}}]}', ["gone.obj"]),
+        ('{"bsdfs": [{"name": "wall", "type": "lambert", "albedo": "gone.png"}]}', ["gone.png"]),
+        ('{"renderer": {"spp": 0}}', ["renderer.spp", "at least 1"]),
         ("[1, 2]", []),
+        ("", ["syntax error"]),
     ],
 )
 def test_bad_scenes(text, words, tmp_path, capfd, renders):
@@ -307,6 +326,15 @@ def test_json_has_no_infinity(tmp_path, render, capfd):
     write_image(image, render.reference)
     assert command.main(["compare", str(image), str(image), "--json"]) == 0
     assert json.loads(capfd.readouterr().out, parse_constant=pytest.fail)["psnr"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("none.exr", ["no such file"]), ("folder", ["this is a folder"])]
+)
+def test_compare_with_what_is_no_image(name, words, tmp_path, capfd):
+    (tmp_path / "folder").mkdir()
+    write_image(tmp_path / "image.exr", np.ones((2, 3, 3), np.float32))
+    fails(capfd, command.main(["compare", str(tmp_path / "image.exr"), str(tmp_path / name)]), name, *words)
 
 
 def test_compare_images_of_two_sizes(tmp_path, capfd):
@@ -422,7 +450,9 @@ def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_pat
         ("-o {tmp}/a.jpg {scene}", ["{tmp}/a.jpg", ".png"]),
         ("-c 10m {scene}", ["--checkpoint", "--host tungsten"]),
         ("--timeout x {scene}", ["--timeout"]),
-        ("{tmp}/none.json", ["{tmp}/none.json"]),
+        ("--dip-denoise --dip-time-budget=-5 {scene}", ["--dip-time-budget", "-5"]),
+        ("{tmp}/none.json", ["{tmp}/none.json", "found none"]),
+        ("{tmp}", ["{tmp}", "found a folder"]),
         ("--nonsense {scene}", ["--nonsense"]),
     ],
 )

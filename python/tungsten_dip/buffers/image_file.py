@@ -40,6 +40,8 @@ def read_parts(path: Path) -> tuple[Part, ...]:
 
     Raises InputError if the file is missing, no such image, deep, truncated or larger than MAX_PIXELS.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: expected an image, this is a folder; name a file in it")
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name")
     if path.suffix.lower() not in RADIANCE_SUFFIXES:

@@ -157,9 +157,8 @@ def _mapped(key: str, value: str, names: list[str], layers: Layers) -> tuple[str
         return channels
     layer = next((layer for layer in layers if layer == value or layer.lower() == value.lower()), None)
     if layer is None:
-        raise InputError(
-            f"--map {key}={value}: no such layer or channel; there are {', '.join(filter(None, layers))}"
-        )
+        present = (name or ", ".join(components.values()) for name, components in layers.items())
+        raise InputError(f"--map {key}={value}: no such layer or channel; there are {', '.join(present)}")
     ordered = _ordered(layers[layer])
     if not ordered:
         raise InputError(

@@ -84,7 +84,9 @@ def _run(arguments: Sequence[str] | None) -> None:
         host = "tungsten" if tungsten_host.available() else "mitsuba"
     log.info("rendering with %s", host.capitalize())
     if host == "mitsuba" and (options.checkpoint or options.dip_preview):
-        raise InputError("Mitsuba saves no checkpoints: leave --checkpoint and --dip-preview out")
+        raise InputError(
+            "Mitsuba saves no checkpoints for --checkpoint and --dip-preview; add --host tungsten"
+        )
     if host == "tungsten" and not options.dip_denoise:
         tungsten_host.run_native(_stock_arguments(arguments))
     if host == "tungsten" and not tungsten_host.in_process():

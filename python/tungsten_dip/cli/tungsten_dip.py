@@ -112,6 +112,8 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     for path, suffix in ((options.output, ".exr"), (options.error_map, ".exr"), (options.report, ".html")):
         if path is not None:
             check_writable(path, (suffix,))
+    if options.error_map is not None and options.error_map.resolve() == options.output.resolve():
+        raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, dict(options.map))

@@ -110,7 +110,8 @@ def _json_from_file(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); check the path and the permissions") from None
     if text is None:
-        raise InputError(f"{path}: expected a Tungsten scene file, found none; check the path")
+        found = "a folder" if path.is_dir() else "none"
+        raise InputError(f"{path}: expected a Tungsten scene file, found {found}; check the path")
 
     repeated: set[str] = set()
 
