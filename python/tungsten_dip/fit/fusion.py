@@ -52,7 +52,7 @@ _NOISE_RADIUS = 8
 _OUTLIER = 20.0
 """A squared error this many times the local mean is an outlier: capped where it tells how noisy a place is."""
 
-_LEAST_NOISE = 0.1
+_LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
 _HIDDEN = 16
@@ -66,6 +66,8 @@ _CHUNK_PIXELS = 1 << 18
 _HISTORY_EVERY = 20
 _HISTORY_PIXELS = 1 << 16
 _ERROR_RADIUS = 4
+_SURE = 0.1
+"""Relative standard error of an estimated relMSE up to which it is believed."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +124,12 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
 
     # The error of the plain mean, by the same evidence.
     noisy = (halves[0] + halves[1]) / 2
-    noisy_estimate = float(np.mean((halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + RELMSE_EPSILON)))
+    noise_of_input = (halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + np.float32(RELMSE_EPSILON))
+    noisy_estimate = float(noise_of_input.mean(dtype=np.float64))
     if estimate >= noisy_estimate:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, estimate = scaled(color.mean), noisy_estimate
-        error = _smooth((halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + RELMSE_EPSILON), threads)
+        error = _core.box_mean(noise_of_input.mean(axis=2, keepdims=True), _ERROR_RADIUS, threads)
     for note in notes:
         _LOG.info(note)
     return FitResult(
@@ -208,16 +211,13 @@ class _Fit:
     def result(self, device: torch.device) -> tuple[FloatImage, FloatImage, float]:
         """Return the image, its error per pixel and the mean of that (relMSE)."""
         shape = self._halves[0].shape
-        fused = [self._fuse_all(half, device).reshape(shape) for half in (0, 1)]
-        image = (fused[0] + fused[1]) / 2
-        unbiased = _squared_error(*self._halves, *fused) / (image**2 + RELMSE_EPSILON)
-        estimate = max(float(unbiased.mean()), 0.0)
+        fused_a, fused_b = (self._fuse_all(half, device) for half in (0, 1))
+        unbiased, spread, estimate = _judged(fused_a, fused_b, self._witnesses(slice(None)))
         # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and the
         # halves' difference, which has little noise, is the least that it can be.
-        spread = (fused[0] - fused[1]) ** 2 / 4 / (image**2 + RELMSE_EPSILON)
         threads = self._guidance.threads
-        error = np.maximum(_smooth(unbiased, threads), _smooth(spread, threads))
-        return image, error, estimate
+        maps = [_core.box_mean(e.reshape(*shape[:2], 1), _ERROR_RADIUS, threads) for e in (unbiased, spread)]
+        return ((fused_a + fused_b) / 2).reshape(shape), np.maximum(*maps), estimate
 
     def _prepare(self) -> None:
         """Build what the network sees, flattened to shape (half, pixel, ...)."""
@@ -297,11 +297,15 @@ class _Fit:
 
     @torch.no_grad()
     def _estimate_at(self, pixel: Tensor, device: torch.device) -> float:
-        fused = [self._fuse(half, pixel, device).cpu().numpy() for half in (0, 1)]
-        halves = [self._other[1 - half, pixel].numpy() for half in (0, 1)]
-        image = (fused[0] + fused[1]) / 2
-        error = _squared_error(halves[0], halves[1], fused[0], fused[1]) / (image**2 + RELMSE_EPSILON)
-        return max(float(error.mean()), 0.0)
+        fused_a, fused_b = (self._fuse(half, pixel, device).cpu().numpy() for half in (0, 1))
+        return _judged(fused_a, fused_b, self._witnesses(pixel))[2]
+
+    def _witnesses(self, pixel: Tensor | slice) -> list[tuple[Array, Array]]:
+        """The noisy halves and, far less noisy but a little blurred, the smallest pilot."""
+        return [
+            (self._choices[0, pixel, index].numpy(), self._choices[1, pixel, index].numpy())
+            for index in (0, 1)
+        ]
 
     def _seconds(self) -> float:
         return time.perf_counter() - self._started
@@ -328,24 +332,30 @@ def _network(inputs: int, outputs: int, generator: torch.Generator) -> nn.Sequen
 Array = npt.NDArray[np.float32]
 
 
-def _squared_error(half_a: Array, half_b: Array, fused_a: Array, fused_b: Array) -> Array:
-    """Estimate the squared error of (fused_a + fused_b) / 2 without bias, in every pixel and colour.
+def _judged(
+    fused_a: Array, fused_b: Array, witnesses: list[tuple[Array, Array]]
+) -> tuple[Array, Array, float]:
+    """Estimate the squared error of f = (fused_a + fused_b) / 2, relative to f^2 + epsilon.
 
-    With independent halves a, b of truth x and outputs f made of one half each, E (f_a - b)^2 is the error of
-    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of f; the mean
-    of two outputs has half of that variance.
+    Arrays have shape (pixels, 3). Returns, per pixel, the unbiased estimate and the part of it that is noise,
+    and their mean over all pixels. With independent witnesses a, b of truth x and outputs f_a, f_b made of one
+    half each, E (f_a - b)^2 is the error of f_a plus the noise of b, E (a - b)^2 the noise of both, and
+    E (f_a - f_b)^2 / 2 the variance of one output; the mean of two has half of that. The first witnesses that
+    leave the mean a small standard error are believed.
     """
-    crossed = (fused_a - half_b) ** 2 + (fused_b - half_a) ** 2
-    return (crossed - (half_a - half_b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
+    denominator = ((fused_a + fused_b) / 2) ** 2 + np.float32(RELMSE_EPSILON)
+    noise = (((fused_a - fused_b) ** 2 / 4) / denominator).mean(axis=1)
+    for half_a, half_b in witnesses:
+        crossed = (fused_a - half_b) ** 2 + (fused_b - half_a) ** 2 - (half_a - half_b) ** 2
+        unbiased = (crossed / 2 / denominator).mean(axis=1) - noise
+        mean = float(unbiased.mean(dtype=np.float64))
+        if float(unbiased.std(dtype=np.float64)) < _SURE * mean * math.sqrt(unbiased.size):
+            break
+    return unbiased, noise, max(mean, float(noise.mean(dtype=np.float64)))
 
 
 def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
     return ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
-
-
-def _smooth(error: FloatImage, threads: int) -> FloatImage:
-    mean = np.ascontiguousarray(error.mean(axis=2, keepdims=True), np.float32)
-    return np.maximum(_core.box_mean(mean, _ERROR_RADIUS, threads), 0)
 
 
 def _capped(error: FloatImage, threads: int) -> FloatImage:
