@@ -1,7 +1,8 @@
 """The data model: one image's worth of evidence, as numpy arrays.
 
-Arrays are float32, C-contiguous, shape (height, width, channels), row 0 at the top. Colour is linear radiance,
-normals are in world space with components in [-1, 1], depth is a distance along the ray (0 where it left the scene).
+Arrays are float32, C-contiguous, shape (height, width, channels), row 0 at the top. Colour is linear
+radiance, normals are in world space with components in [-1, 1], depth is a distance along the ray (0 where it
+left the scene).
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ FEATURES = ("albedo", "normal", "depth", "visibility")
 class Buffer:
     """One quantity of an image: its mean over all samples and, where known, what is known of its noise.
 
-    ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the variance of
-    ``mean`` (not of one sample). All have the shape of ``mean``.
+    ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the
+    variance of ``mean`` (not of one sample). All have the shape of ``mean``.
     """
 
     mean: FloatImage
@@ -57,9 +58,9 @@ class Buffer:
 class RenderBuffers:
     """Everything a renderer tells of one image.
 
-    ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies. ``alpha``
-    has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the output, ``source``
-    the channels of the file that was read, in their own pixel types, for the same purpose.
+    ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies.
+    ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
+    output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose.
 
     Raises InputError if the shapes or the channel counts do not fit together.
     """
@@ -81,8 +82,9 @@ class RenderBuffers:
                 shape = (*expected, CHANNELS[quantity])
                 if array.shape != shape or array.dtype != np.float32:
                     raise InputError(
-                        f"{quantity} {plane}: expected float32 of shape {shape} (height, width, channels) as the "
-                        f"colour has it, got {array.dtype} of shape {array.shape}; render all buffers at one size"
+                        f"{quantity} {plane}: expected float32 of shape {shape} (height, width, channels) as "
+                        f"the colour has it, got {array.dtype} of shape {array.shape}; render all buffers at "
+                        f"one size"
                     )
 
     @property

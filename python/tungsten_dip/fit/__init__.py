@@ -16,9 +16,10 @@ def denoise(
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 
-    ``buffers`` hold linear radiance of any exposure; they are sanitised first, and only the colour is required.
-    The result is linear radiance of the same shape, finite everywhere. The same buffers, settings, threads and
-    machine give the same bits. Ctrl-C during the training of the network ends it early with what was reached.
+    ``buffers`` hold linear radiance of any exposure; they are sanitised first, and only the colour is
+    required. The result is linear radiance of the same shape, finite everywhere. The same buffers, settings,
+    threads and machine give the same bits. Ctrl-C during the training of the network ends it early with what
+    was reached.
 
     Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is.
     """

@@ -105,7 +105,7 @@ def _ldr_from_feature(quantity: str, buffer: Buffer) -> list[FloatImage]:
     images = []
     for plane, values in buffer.planes():
         if plane != "variance" and quantity == "normal":
-            values = (values + 1) / 2
+            values = np.float32(0.5) * (values + 1)
         elif plane != "variance" and quantity == "depth":
             values = values / max(values.max(initial=0, where=np.isfinite(values)), np.finfo(np.float32).tiny)
         images.append(np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3)))

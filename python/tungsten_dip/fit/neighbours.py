@@ -14,6 +14,7 @@ def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
         np.minimum(np.arange(n) + radius, n - 1) - np.maximum(np.arange(n) - radius, 0) + 1
         for n in image.shape[:2]
     )
-    count = np.outer(rows, columns).astype(np.float32)[..., None]
+    count: FloatImage = np.outer(rows, columns).astype(np.float32)[..., None]
     others: FloatImage = _core.box_mean(image, radius, threads) * count - image
-    return others / np.maximum(count - 1, np.float32(1))
+    others /= np.maximum(count - 1, 1)
+    return others

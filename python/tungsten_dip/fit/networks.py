@@ -48,7 +48,8 @@ class Skip(nn.Module):
         deeper = (*channels[1:], channels[-1])
         self.down = nn.ModuleList(_Down(i, o) for i, o in zip(sources, channels, strict=True))
         self.side = nn.ModuleList(
-            _Side(i, s) if s else None for i, s in zip(sources, skip_channels, strict=True)
+            _Side(i, s) if s else None  # type: ignore[misc]  # torch takes None as well
+            for i, s in zip(sources, skip_channels, strict=True)
         )
         self.up = nn.ModuleList(
             _Up(s + d, o) for s, d, o in zip(skip_channels, deeper, channels, strict=True)
@@ -70,7 +71,8 @@ class Skip(nn.Module):
         for up, across in coarse:
             x = up(x, across)
         up, across = finest
-        return up(x, across, then=lambda y: self.final(self.head(y)))[:, :, :height, :width]
+        x = cast(Tensor, up(x, across, then=lambda y: self.final(self.head(y))))
+        return x[:, :, :height, :width]
 
 
 class ResNet(nn.Module):
@@ -134,7 +136,8 @@ class _NormAct(_Norm):
         # torch's batch norm crawls where few channels lie last in memory.
         few_last = x.shape[1] < 16 and x.permute(0, 2, 3, 1).is_contiguous()
         if few_last and x.requires_grad and x.device.type == "cpu":
-            return cast(Tensor, _NormActOfRows.apply(x, self.weight, self.bias, self.eps))
+            rows = _NormActOfRows.apply(x, self.weight, self.bias, self.eps)  # type: ignore[no-untyped-call]
+            return cast(Tensor, rows)
         return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
 
 
@@ -154,7 +157,7 @@ class _NormActOfRows(torch.autograd.Function):
         return y.view(x.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         """Return the gradients of x, weight and bias."""
         offset, y, weight, inverse_std = ctx.saved_tensors
         width = grad.shape[3]
@@ -234,14 +237,14 @@ class _Up(nn.Module):
         batch, _, height, width = coarse.shape
         edged = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
 
-        mean, variance = _UpsampledMoments.apply(coarse, self.blur)
+        mean, variance = _UpsampledMoments.apply(coarse, self.blur)  # type: ignore[no-untyped-call]
 
         # The norm is affine, so it goes into the weights.
         scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
         shift = self.norm.bias - mean * scale
         bias = self.conv.bias + self.conv.weight.sum((2, 3)) @ shift
         kernel = (self.conv.weight * scale[:, None, None]).flatten(2) @ self.phase_kernels
-        kernel = kernel.unflatten(2, (4, 3, 3)).permute(2, 0, 1, 3, 4).flatten(0, 1)
+        kernel = kernel.reshape(*kernel.shape[:2], 4, 3, 3).permute(2, 0, 1, 3, 4).flatten(0, 1)
         y = F.conv2d(edged, kernel.contiguous(memory_format=torch.channels_last), bias.repeat(4))
         return y.permute(0, 2, 3, 1).reshape(batch, height, width * 4, -1).permute(0, 3, 1, 2)
 
@@ -264,7 +267,7 @@ class _UpsampledMoments(torch.autograd.Function):
         return mean, _pixel_mean(offset * blurred)
 
     @staticmethod
-    def backward(ctx: Any, grad_mean: Tensor, grad_variance: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad_mean: Tensor, grad_variance: Tensor) -> tuple[Tensor, None]:
         """Return the gradient of x."""
         (blurred,) = ctx.saved_tensors
         pixels = blurred.numel() // blurred.shape[1]
@@ -274,7 +277,7 @@ class _UpsampledMoments(torch.autograd.Function):
 
 def _image_from_phases(y: Tensor, height: int, width: int) -> Tensor:
     """Bring (batch, channels, height, width * 2 * 2) into the order of an image twice as high and wide."""
-    y = y.permute(0, 2, 3, 1).unflatten(2, (width, 2, 2)).transpose(2, 3)
+    y = y.permute(0, 2, 3, 1).reshape(y.shape[0], height, width, 2, 2, -1).transpose(2, 3)
     return y.reshape(y.shape[0], 2 * height, 2 * width, -1).permute(0, 3, 1, 2)
 
 

@@ -20,8 +20,8 @@ class FitSettings:
     """Settings of one fit. None means: as the preset has it.
 
     ``network``, ``inputs``, ``scheme`` and ``channels`` describe the network of the published method and are
-    used by the preset ``paper`` alone. ``target_error`` is a relMSE (epsilon 0.01). ``threads`` None uses every
-    core.
+    used by the preset ``paper`` alone. ``target_error`` is a relMSE (epsilon 0.01). ``threads`` None uses
+    every core.
 
     Raises InputError if a number is out of its range.
     """
@@ -64,8 +64,8 @@ class FitResult:
 
     ``color`` is linear radiance, float32, shape (height, width, 3). ``error`` is the estimated squared error
     relative to the squared radiance (relMSE, epsilon 0.01) of every pixel, shape (height, width, 1); its mean
-    is ``estimated_relmse``. Both are None where the buffers hold no independent evidence to estimate them from.
-    ``notes`` says in one line each what evidence was missing and what that meant.
+    is ``estimated_relmse``. Both are None where the buffers hold no independent evidence to estimate them
+    from. ``notes`` says in one line each what evidence was missing and what that meant.
     """
 
     color: FloatImage
