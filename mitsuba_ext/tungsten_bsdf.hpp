@@ -11,13 +11,15 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <numbers>
 #include <sstream>
 #include <string>
 #include <utility>
 
 namespace mitsuba {
 
-constexpr float kInvPi = 0.318309886f;
+constexpr float kInvPi = std::numbers::inv_pi_v<float>;
 constexpr float kTwoPi = 6.283185307f;
 
 template <typename Scalar>
@@ -33,11 +35,11 @@ struct FresnelTerm {
 // Fresnel's reflectance of a dielectric interface; `eta` is the index on this side over the one beyond.
 inline FresnelTerm dielectric_fresnel(float eta, float cos_i) {
     const float sin_t_squared = eta * eta * (1.f - cos_i * cos_i);
-    if (sin_t_squared > 1.f) return {1.f, 0.f};
+    if (sin_t_squared > 1.f) return {.reflectance = 1.f, .cos_t = 0.f};
     const float cos_t = std::sqrt(std::max(1.f - sin_t_squared, 0.f));
     const float r_s = (eta * cos_i - cos_t) / (eta * cos_i + cos_t);
     const float r_p = (eta * cos_t - cos_i) / (eta * cos_t + cos_i);
-    return {0.5f * (r_s * r_s + r_p * r_p), cos_t};
+    return {.reflectance = 0.5f * (r_s * r_s + r_p * r_p), .cos_t = cos_t};
 }
 
 // The cosine-weighted mean over the hemisphere of the reflectance inside a medium of index `ior`.
@@ -46,15 +48,15 @@ inline float diffuse_fresnel_inside(float ior) {
     double sum = 0;
     for (int i = 0; i < kSteps; ++i) {
         const double cos_squared = (i + 0.5) / kSteps;
-        sum += dielectric_fresnel(ior, float(std::sqrt(cos_squared))).reflectance;
+        sum += dielectric_fresnel(ior, static_cast<float>(std::sqrt(cos_squared))).reflectance;
     }
-    return float(sum / kSteps);
+    return static_cast<float>(sum / kSteps);
 }
 
 // Reflection by the microfacets of a dielectric surface (Walter et al., "Microfacet Models for Refraction
 // through Rough Surfaces", EGSR 2007), with their three distributions.
 struct RoughReflection {
-    enum class Distribution { Beckmann, Phong, Ggx };
+    enum class Distribution : std::uint8_t { Beckmann, Phong, Ggx };
 
     Distribution distribution = Distribution::Ggx;
     float roughness = 0.1f;
@@ -68,17 +70,17 @@ struct RoughReflection {
     }
 
     // The parameter of the distribution; Phong's is an exponent.
-    float alpha(float of_roughness) const {
+    [[nodiscard]] float alpha(float of_roughness) const {
         const float clamped = std::max(of_roughness, 1e-3f);
         return distribution == Distribution::Phong ? 2.f / (clamped * clamped) - 2.f : clamped;
     }
 
     // Wider than the surface at grazing angles, which keeps the weights small (Walter et al., section 5.3).
-    float sampling_alpha(float cos_i) const {
+    [[nodiscard]] float sampling_alpha(float cos_i) const {
         return alpha((1.2f - 0.2f * std::sqrt(std::abs(cos_i))) * roughness);
     }
 
-    float density(float alpha, float cos_m) const {
+    [[nodiscard]] float density(float alpha, float cos_m) const {
         if (cos_m <= 0.f) return 0.f;
         const float cos_squared = cos_m * cos_m;
         const float tan_squared = std::max(1.f - cos_squared, 0.f) / cos_squared;
@@ -86,13 +88,13 @@ struct RoughReflection {
             case Distribution::Beckmann:
                 return kInvPi * std::exp(-tan_squared / squared(alpha)) / squared(alpha * cos_squared);
             case Distribution::Phong:
-                return (alpha + 2.f) / kTwoPi * float(std::pow(double(cos_m), double(alpha)));
+                return (alpha + 2.f) / kTwoPi * static_cast<float>(std::pow(double{cos_m}, double{alpha}));
             default:
                 return kInvPi * squared(alpha / (cos_squared * (squared(alpha) + tan_squared)));
         }
     }
 
-    float shadowing(float alpha, float cos_v) const {
+    [[nodiscard]] float shadowing(float alpha, float cos_v) const {
         if (cos_v <= 0.f) return 0.f;
         const float tangent = std::sqrt(std::max(1.f - cos_v * cos_v, 0.f)) / cos_v;
         if (tangent == 0.f) return 1.f;
@@ -104,7 +106,7 @@ struct RoughReflection {
     }
 
     template <typename Vector3f>
-    float eval(const Vector3f& wi, const Vector3f& wo) const {
+    [[nodiscard]] float eval(const Vector3f& wi, const Vector3f& wo) const {
         const Vector3f m = dr::normalize(wi + wo);
         const float a = alpha(roughness);
         const float reflectance = dielectric_fresnel(1.f / ior, dr::dot(wi, m)).reflectance;
@@ -112,14 +114,14 @@ struct RoughReflection {
     }
 
     template <typename Vector3f>
-    float pdf(const Vector3f& wi, const Vector3f& wo) const {
+    [[nodiscard]] float pdf(const Vector3f& wi, const Vector3f& wo) const {
         const Vector3f m = dr::normalize(wi + wo);
         return density(sampling_alpha(wi.z()), m.z()) * m.z() * 0.25f / std::abs(dr::dot(wi, m));
     }
 
     // A direction of reflection; it may point below the surface.
     template <typename Vector3f, typename Point2f>
-    Vector3f sample(const Vector3f& wi, const Point2f& u) const {
+    [[nodiscard]] Vector3f sample(const Vector3f& wi, const Point2f& u) const {
         const float a = sampling_alpha(wi.z());
         float cos_m;
         switch (distribution) {
@@ -127,7 +129,7 @@ struct RoughReflection {
                 cos_m = 1.f / std::sqrt(1.f - squared(a) * std::log(1.f - u.x()));
                 break;
             case Distribution::Phong:
-                cos_m = float(std::pow(double(u.x()), 1.0 / (double(a) + 2.0)));
+                cos_m = static_cast<float>(std::pow(double{u.x()}, 1.0 / (double{a} + 2.0)));
                 break;
             default:
                 cos_m = 1.f / std::sqrt(1.f + squared(a) * u.x() / (1.f - u.x()));
@@ -147,22 +149,22 @@ class TungstenBsdf : public BSDF<Float, Spectrum> {
 
     using Base::Base;
 
-    Spectrum eval(const BSDFContext&, const SurfaceInteraction3f& si, const Vector3f& wo,
+    Spectrum eval(const BSDFContext& /*context*/, const SurfaceInteraction3f& si, const Vector3f& wo,
                   Mask active) const override {
         return active ? evaluate(si, wo).first : Spectrum(0.f);
     }
 
-    Float pdf(const BSDFContext&, const SurfaceInteraction3f& si, const Vector3f& wo,
+    Float pdf(const BSDFContext& /*context*/, const SurfaceInteraction3f& si, const Vector3f& wo,
               Mask active) const override {
         return active ? evaluate(si, wo).second : 0.f;
     }
 
-    std::pair<Spectrum, Float> eval_pdf(const BSDFContext&, const SurfaceInteraction3f& si,
+    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& /*context*/, const SurfaceInteraction3f& si,
                                         const Vector3f& wo, Mask active) const override {
         return active ? evaluate(si, wo) : std::pair<Spectrum, Float>(0.f, 0.f);
     }
 
-    std::string to_string() const override { return std::string(this->class_name()) + "[]"; }
+    [[nodiscard]] std::string to_string() const override { return std::string(this->class_name()) + "[]"; }
 
   protected:
     virtual std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const = 0;
@@ -174,7 +176,7 @@ class TungstenBsdf : public BSDF<Float, Spectrum> {
 
     // A sample of a lobe; its density is filled in by the caller.
     static BSDFSample3f sample_of(const Vector3f& wo, BSDFFlags lobe, uint32_t component) {
-        BSDFSample3f bs = dr::zeros<BSDFSample3f>();
+        auto bs = dr::zeros<BSDFSample3f>();
         bs.wo = wo;
         bs.eta = 1.f;
         bs.sampled_type = +lobe;
