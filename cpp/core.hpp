@@ -125,7 +125,8 @@ void prefilter_feature(const Buffer& in, const Buffer& out, int threads);
 // How a pixel's neighbours are chosen and weighted in a local regression.
 struct RegressionWindow {
     int radius = 9;        // pixels to each side
-    int step = 1;          // every step-th pixel of a row and column is looked at
+    int step = 1;          // a fit looks at every step-th pixel of a row and column; above 1, predictions are
+                           // gathered from every (step + 1)-th
     int patch_radius = 1;  // the guide is compared in patches of this radius
     float k = 1;           // how many standard deviations of the guide's noise count as equal
     float ridge = 1e-3F;   // added to the variance of every feature: keeps flat ones from explaining noise

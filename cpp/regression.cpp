@@ -254,11 +254,17 @@ class Regression {
         });
     }
 
-    // Calls body(offset, weights) for every offset of the window at which the tile has a neighbour.
+    // The pixels that a window's fit skips must not be skipped again when predictions are gathered, or the
+    // image would fall apart into grids that know nothing of each other.
+    [[nodiscard]] int gather_step() const { return window_.step == 1 ? 1 : window_.step + 1; }
+
+    // Calls body(offset), with scratch.weights set, for every step-th offset of the window, the pixel itself
+    // among them, at which the tile has a neighbour.
     template <typename Body>
-    void for_all_offsets(const Tile& tile, Scratch& scratch, const Body& body) const {
-        for (int dy = -window_.radius; dy <= window_.radius; dy += window_.step) {
-            for (int dx = -window_.radius; dx <= window_.radius; dx += window_.step) {
+    void for_all_offsets(const Tile& tile, int step, Scratch& scratch, const Body& body) const {
+        const int reach = window_.radius / step * step;
+        for (int dy = -reach; dy <= reach; dy += step) {
+            for (int dx = -reach; dx <= reach; dx += step) {
                 const bool any_row = tile.y + tile.height > -dy && tile.y + dy < target_.height();
                 const bool any_column = tile.x + tile.width > -dx && tile.x + dx < target_.width();
                 if (!any_row || !any_column) continue;
@@ -342,7 +348,7 @@ class Regression {
         const int n = features_.channels();
         const int sum_count = (n + 1) * (n + 2) / 2 + colors * (n + 1);
         scratch.sums.assign(static_cast<std::size_t>(sum_count) * tile_pixels, 0);
-        for_all_offsets(tile, scratch, [&](Offset offset) {
+        for_all_offsets(tile, window_.step, scratch, [&](Offset offset) {
             for (int i = 0; i < tile.height; ++i) {
                 const int y = tile.y + i;
                 const int neighbour_y = y + offset.y;
@@ -399,7 +405,7 @@ class Regression {
         const int n = features_.channels();
         scratch.sums.assign(std::size_t{colors + 1} * tile_pixels, 0);
         std::vector<const float*> coefficients(static_cast<std::size_t>(coefficients_.channels()));
-        for_all_offsets(tile, scratch, [&](Offset offset) {
+        for_all_offsets(tile, gather_step(), scratch, [&](Offset offset) {
             for (int i = 0; i < tile.height; ++i) {
                 const int y = tile.y + i;
                 const int neighbour_y = y + offset.y;

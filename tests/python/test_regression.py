@@ -43,11 +43,12 @@ def _plain_regress(
     """What `_core.regress` says it does, pixel by pixel."""
     height, width = target.shape[:2]
     y, f = target.astype(np.float64), features.astype(np.float64)
-    weights: dict[tuple[int, int], list[tuple[int, int, float]]] = {}
-    for row, column in np.ndindex(height, width):
-        weights[row, column] = []
-        for dy in range(-radius, radius + 1, step):
-            for dx in range(-radius, radius + 1, step):
+
+    def weighed(row: int, column: int, step: int) -> list[tuple[int, int, float]]:
+        found = []
+        reach = radius // step * step
+        for dy in range(-reach, reach + 1, step):
+            for dx in range(-reach, reach + 1, step):
                 if not (0 <= row + dy < height and 0 <= column + dx < width):
                     continue
                 distance = 0.0
@@ -56,10 +57,12 @@ def _plain_regress(
                     distance = max(_patch_distance(guide, guide_variance, at, patch_radius, k), 0.0)
                 apart = f[row, column] - f[row + dy, column + dx]
                 distance += float(np.dot(penalty, apart**2))
-                weights[row, column].append((row + dy, column + dx, np.exp(-distance)))
+                found.append((row + dy, column + dx, np.exp(-distance)))
+        return found
 
     fits = {}
-    for pixel, neighbours in weights.items():
+    for pixel in np.ndindex(height, width):
+        neighbours = weighed(*pixel, step)
         w = np.array([weight for *_, weight in neighbours])
         w /= w.sum()
         x = np.array([f[row, column] for row, column, _ in neighbours])
@@ -71,7 +74,8 @@ def _plain_regress(
         fits[pixel] = (mean_x, mean_y, slope)
 
     out = np.empty_like(y)
-    for pixel, neighbours in weights.items():
+    for pixel in np.ndindex(height, width):
+        neighbours = weighed(*pixel, 1 if step == 1 else step + 1)
         predictions = np.zeros(3)
         for row, column, weight in neighbours:
             mean_x, mean_y, slope = fits[row, column]
@@ -158,16 +162,18 @@ def test_repeated_and_constant_features_do_no_harm() -> None:
     )
 
 
-@pytest.mark.parametrize("step", [1, 3])
+@pytest.mark.parametrize("step", [1, 2])
 def test_noise_falls_with_the_size_of_the_window(step: int) -> None:
-    radius = 3
-    noise = np.random.default_rng(2).standard_normal((120, 130, 3)).astype(np.float32)
-    features = np.empty((120, 130, 0), np.float32)
+    radius = 6
+    noise = np.random.default_rng(2).standard_normal((220, 230, 3)).astype(np.float32)
+    features = np.empty((220, 230, 0), np.float32)
     out = _core.regress(noise, features, (), radius=radius, step=step)[12:-12, 12:-12]
-    # A mean over n taps each way of a mean over n taps is a triangle: the sum of its squares, twice.
-    n = 2 * radius // step + 1
-    triangle = np.convolve(np.ones(n), np.ones(n)) / n**2
-    assert out.var() == pytest.approx((triangle**2).sum() ** 2, rel=0.1)
+
+    def taps(step: int) -> npt.NDArray[np.float64]:
+        return np.where(np.arange(-radius, radius + 1) % step == 0, 1.0, 0.0)
+
+    both = np.convolve(taps(step), taps(1 if step == 1 else step + 1))
+    assert out.var() == pytest.approx(((both / both.sum()) ** 2).sum() ** 2, rel=0.15)
 
 
 def test_a_guide_keeps_an_edge_that_no_feature_shows() -> None:
