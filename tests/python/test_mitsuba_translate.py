@@ -479,6 +479,31 @@ def test_shared_objects_are_made_once(folder: Path) -> None:
     assert len(translated.albedo) == 1
 
 
+def loaded(folder: Path, primitives: list[Json], **sections: Any) -> Any:
+    """The scene as Mitsuba loads it, with Mitsuba's own integrator in place of ours."""
+    path = folder / "scene.json"
+    path.write_text(json.dumps({"primitives": primitives, **sections}))
+    with mitsuba_variant() as mi:
+        return mi.load_dict({**translate(load_scene(path)).scene, "integrator": {"type": "path"}})
+
+
+@pytest.mark.parametrize(("aperture_size", "samples_lens"), [(0.0, False), (0.1, True)])
+def test_the_lens_is_sampled_only_where_it_is_open(
+    folder: Path, aperture_size: float, samples_lens: bool
+) -> None:
+    camera = {"type": "thinlens", "aperture_size": aperture_size, "resolution": [4, 3]}
+    sensor = loaded(folder, [FLOOR, WHITE_SKY], camera=camera).sensors()[0]
+    assert sensor.needs_aperture_sample() == samples_lens
+
+
+@pytest.mark.parametrize("used", [False, True])
+def test_media_are_built_only_where_they_fill_something(folder: Path, used: bool) -> None:
+    gas = {"name": "gas", "type": "homogeneous", "sigma_s": 1.0}
+    box = {"type": "cube", "bsdf": {"type": "forward"}, **({"int_medium": "gas"} if used else {})}
+    scene = loaded(folder, [FLOOR, box, WHITE_SKY], media=[gas])
+    assert any(shape.is_medium_transition() for shape in scene.shapes()) == used
+
+
 # --- Refusals ---------------------------------------------------------------------------------------
 
 
