@@ -20,10 +20,11 @@ import torch
 from torch import Tensor, nn
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.fit.device import compute_device
 from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
@@ -43,14 +44,20 @@ RELMSE_EPSILON = 0.01
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
 
+_BRIGHTEST = 1e15
+"""Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
+
 _ONLY_PILOT = Pilot(9, k=1.0)
 """Used alone where nothing can score the pilots."""
+
+_CONVERGED = 1e-5
+"""relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
 _LOG_OFFSET = 0.02
 _SCORE_RADII = (2, 4, 8)
 _NOISE_RADIUS = 8
 _OUTLIER = 20.0
-"""A squared error this many times the local mean is an outlier: capped where it tells how noisy a place is."""
+"""A squared error this many times the local mean is an outlier: capped where it tells of a place's noise."""
 
 _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
@@ -89,10 +96,12 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
     threads = settings.threads or 0
     notes: list[str] = []
     scale = _exposure(buffers.color.mean)
-    variance = None if buffers.color.variance is None else buffers.color.variance * np.float32(scale**2)
 
     def scaled(image: FloatImage) -> FloatImage:
-        return image * np.float32(scale)
+        brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
+        return np.minimum(image, np.float32(brightest)) * np.float32(scale)
+
+    variance = None if buffers.color.variance is None else scaled(scaled(buffers.color.variance))
 
     missing = [name for name in ("albedo", "normal", "depth") if getattr(buffers, name) is None]
     if missing:
@@ -103,6 +112,11 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
     color = buffers.color
     test = halves_independent(buffers, settings.threads)
     if color.half_a is None or color.half_b is None or not test.independent:
+        if _converged(color):
+            notes.append("the halves agree to within a few thousandths: the image is returned as it is")
+            seconds = time.perf_counter() - started
+            progress(1.0, "converged")
+            return FitResult(color.mean.copy(), settings, seconds, iterations=0, notes=tuple(notes))
         notes.append(_why_no_halves(buffers, test))
         guides, irradiances, noise = first_pilots((scaled(color.mean),), variance, guidance)
         (image,) = pilot_images(_ONLY_PILOT, irradiances, guides, noise, guidance)
@@ -213,11 +227,11 @@ class _Fit:
         shape = self._halves[0].shape
         fused_a, fused_b = (self._fuse_all(half, device) for half in (0, 1))
         unbiased, spread, estimate = _judged(fused_a, fused_b, self._witnesses(slice(None)))
-        # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and the
-        # halves' difference, which has little noise, is the least that it can be.
+        # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and
+        # the halves' difference, which has little noise, is the least that it can be.
         threads = self._guidance.threads
         maps = [_core.box_mean(e.reshape(*shape[:2], 1), _ERROR_RADIUS, threads) for e in (unbiased, spread)]
-        return ((fused_a + fused_b) / 2).reshape(shape), np.maximum(*maps), estimate
+        return (np.float32(0.5) * (fused_a + fused_b)).reshape(shape), np.maximum(*maps), estimate
 
     def _prepare(self) -> None:
         """Build what the network sees, flattened to shape (half, pixel, ...)."""
@@ -249,7 +263,7 @@ class _Fit:
                 denominators[half]
                 * (
                     _LEAST_NOISE
-                    + _mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
+                    + mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
                 )
             )
             for half in (0, 1)
@@ -258,7 +272,7 @@ class _Fit:
 
         per_half = []
         for half in (0, 1):
-            noise = _mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
+            noise = mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
             cap = _OUTLIER * noise + np.float32(1e-3)
             reference = np.minimum(errors[self._best][half], cap)
             columns = [self._guidance.features, np.log(noise + np.float32(1e-4))]
@@ -270,7 +284,7 @@ class _Fit:
                 columns.append(np.clip(_log_level(pilot[half]) - base, -2, 2))
                 worse = np.minimum(errors[index][half], cap) - reference
                 for radius in _SCORE_RADII:
-                    score = _mean_around(worse, radius, threads) / (
+                    score = mean_around(worse, radius, threads) / (
                         np.float32(0.05) * noise + np.float32(1e-4)
                     )
                     columns.append(np.clip(score, -3, 3))
@@ -284,7 +298,8 @@ class _Fit:
     def _fuse(self, half: Tensor | int, pixel: Tensor | slice, device: torch.device) -> Tensor:
         logits = self._network(self._inputs[half, pixel].to(device))
         logits[:, self._best] += _HEAD_START
-        return (logits.softmax(1)[..., None] * self._choices[half, pixel].to(device)).sum(1)
+        fused: Tensor = (logits.softmax(1)[..., None] * self._choices[half, pixel].to(device)).sum(1)
+        return fused
 
     @torch.no_grad()
     def _fuse_all(self, half: int, device: torch.device) -> FloatImage:
@@ -338,9 +353,9 @@ def _judged(
     """Estimate the squared error of f = (fused_a + fused_b) / 2, relative to f^2 + epsilon.
 
     Arrays have shape (pixels, 3). Returns, per pixel, the unbiased estimate and the part of it that is noise,
-    and their mean over all pixels. With independent witnesses a, b of truth x and outputs f_a, f_b made of one
-    half each, E (f_a - b)^2 is the error of f_a plus the noise of b, E (a - b)^2 the noise of both, and
-    E (f_a - f_b)^2 / 2 the variance of one output; the mean of two has half of that. The first witnesses that
+    and their mean over all pixels. With independent witnesses a, b of truth x and outputs f_a, f_b made of
+    one half each, E (f_a - b)^2 is the error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E
+    (f_a - f_b)^2 / 2 the variance of one output; the mean of two has half of that. The first witnesses that
     leave the mean a small standard error are believed.
     """
     denominator = ((fused_a + fused_b) / 2) ** 2 + np.float32(RELMSE_EPSILON)
@@ -355,26 +370,29 @@ def _judged(
 
 
 def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
-    return ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
+    error: FloatImage = ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
+    return error
 
 
 def _capped(error: FloatImage, threads: int) -> FloatImage:
-    return np.minimum(error, np.float32(_OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads))
-
-
-def _mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
-    """The local mean without the pixel itself (0 where there is no other)."""
-    height, width = image.shape[:2]
-    rows, columns = (
-        np.minimum(np.arange(n) + radius, n - 1) - np.maximum(np.arange(n) - radius, 0) + 1
-        for n in (height, width)
-    )
-    count = np.outer(rows, columns).astype(np.float32)[..., None]
-    return (_core.box_mean(image, radius, threads) * count - image) / np.maximum(count - 1, 1)
+    limit = np.float32(_OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
+    capped: FloatImage = np.minimum(error, limit)
+    return capped
 
 
 def _log_level(image: FloatImage) -> FloatImage:
-    return np.log(image.mean(axis=2, keepdims=True) + np.float32(_LOG_OFFSET))
+    log_level: FloatImage = np.log(image.mean(axis=2, keepdims=True) + np.float32(_LOG_OFFSET))
+    return log_level
+
+
+def _converged(color: Buffer) -> bool:
+    """Whether halves differ (copies do not) by less than lets a test tell if their noise is independent."""
+    if color.half_a is None or color.half_b is None:
+        return False
+    squared = color.mean**2 + np.float32(RELMSE_EPSILON)
+    noise = float(np.mean((color.half_a - color.half_b) ** 2 / 4 / squared))
+    sampled = 0.0 if color.variance is None else float(np.mean(color.variance / squared))
+    return 0 < noise < _CONVERGED and sampled < _CONVERGED
 
 
 def _exposure(color: FloatImage) -> float:

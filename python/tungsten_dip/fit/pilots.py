@@ -1,12 +1,11 @@
 """Pilots: closed-form guesses at the clean image, among which a network later chooses pixel by pixel.
 
-Every pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
-window of its own. Each half of the samples is denoised from its own samples alone: what one half's pilots
+Every pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in
+a window of its own. Each half of the samples is denoised from its own samples alone: what one half's pilots
 predict is scored by the other half, whose noise they have never seen.
 """
 
 from __future__ import annotations
-
 
 from dataclasses import dataclass
 
@@ -16,8 +15,9 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 
-# Features are scaled so that one unit is a difference which separates two surfaces; these penalties of squared
-# differences stand for normals 35 degrees apart, albedos 0.2 apart and depths a tenth of the scene's apart.
+# Features are scaled so that one unit is a difference which separates two surfaces; these penalties of
+# squared differences stand for normals 35 degrees apart, albedos 0.2 apart and depths a tenth of the scene's
+# apart.
 _NORMAL_PENALTY = 3.0
 _ALBEDO_PENALTY = 20.0
 _DEPTH_PENALTY = 5.0
@@ -31,7 +31,7 @@ _BLACK_ALBEDO = 1e-3
 """Below it a surface's colour cannot come from its albedo (a specular one, say) and is not divided by it."""
 
 _GUIDE_OFFSET = 0.05
-"""Guides are compared as log(radiance + offset); the offset is where the eye stops to see noise as relative."""
+"""Guides are compared as log(radiance + offset), where the eye stops to see noise as relative."""
 
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
@@ -91,7 +91,10 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
         mean = filtered.albedo.mean
         scaled.append((np.clip(mean, 0, 1), _ALBEDO_PENALTY))
         black = mean.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
-        albedo = np.where(black, np.float32(1), np.maximum(mean, 0) + np.float32(_LEAST_ALBEDO))
+        # Above 1 it is light that a surface emits, which the colour must show too. What the colour does not
+        # show is a wild value, and would be smeared over its surroundings.
+        bounded = np.clip(mean, 0, np.maximum(2 * buffers.color.mean, 1))
+        albedo = np.where(black, np.float32(1), bounded + np.float32(_LEAST_ALBEDO))
     if filtered.normal is not None:
         scaled.append((np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
     if filtered.depth is not None:
