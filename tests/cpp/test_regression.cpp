@@ -17,10 +17,13 @@ using namespace tungsten_dip;
 namespace {
 
 struct Size {
-    int height, width;
+    int height;
+    int width;
 };
 // Around one tile of 8x64 pixels, and far from it.
-constexpr std::array sizes{Size{1, 1}, Size{1, 65}, Size{9, 1}, Size{7, 5}, Size{8, 64}, Size{9, 130}};
+constexpr std::array sizes{Size{.height = 1, .width = 1},  Size{.height = 1, .width = 65},
+                           Size{.height = 9, .width = 1},  Size{.height = 7, .width = 5},
+                           Size{.height = 8, .width = 64}, Size{.height = 9, .width = 130}};
 
 Pixels noise(Size size, int channels, unsigned seed, double sigma = 1) {
     std::mt19937 generator(seed);  // NOLINT(misc-const-correctness): the distribution changes it

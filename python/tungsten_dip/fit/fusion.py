@@ -137,12 +137,12 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
         image, error, estimate = fit.result(device)
 
     # The error of the plain mean, by the same evidence.
-    noisy = (halves[0] + halves[1]) / 2
+    noisy = np.float32(0.5) * (halves[0] + halves[1])
     noise_of_input = (halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + np.float32(RELMSE_EPSILON))
     noisy_estimate = float(noise_of_input.mean(dtype=np.float64))
     if estimate >= noisy_estimate:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
-        image, estimate = scaled(color.mean), noisy_estimate
+        image, estimate = scaled(color.mean) if fireflies is None else noisy, noisy_estimate
         error = _core.box_mean(noise_of_input.mean(axis=2, keepdims=True), _ERROR_RADIUS, threads)
     for note in notes:
         _LOG.info(note)

@@ -91,9 +91,9 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
         mean = filtered.albedo.mean
         scaled.append((np.clip(mean, 0, 1), _ALBEDO_PENALTY))
         black = mean.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
-        # Above 1 it is light that a surface emits, which the colour must show too. What the colour does not
-        # show is a wild value, and would be smeared over its surroundings.
-        bounded = np.clip(mean, 0, np.maximum(2 * buffers.color.mean, 1))
+        # Well above 1 it is light that a surface emits, which the colour must show too. What the colour does
+        # not show is a wild value, and would be smeared over its surroundings.
+        bounded = np.clip(mean, 0, 2 * np.maximum(buffers.color.mean, 1))
         albedo = np.where(black, np.float32(1), bounded + np.float32(_LEAST_ALBEDO))
     if filtered.normal is not None:
         scaled.append((np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))

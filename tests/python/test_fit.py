@@ -1,0 +1,318 @@
+"""Denoising by fusion: closer to the truth than its input, honest about its error, safe with any input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import MakeRender, SyntheticRender
+from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit import FitResult, FitSettings, denoise
+from tungsten_dip.fit.pilots import guidance_from_buffers
+
+pytest.importorskip("torch")
+
+
+def _settings(**changes: Any) -> FitSettings:
+    return FitSettings(**{"preset": "draft", "iterations": 30, "threads": 1, "device": "cpu", **changes})
+
+
+def _rel_mse(image: FloatImage, reference: FloatImage) -> float:
+    return float(np.mean((image - reference) ** 2 / (reference**2 + 0.01)))
+
+
+def _check(result: FitResult, buffers: RenderBuffers) -> None:
+    """What holds of every result."""
+    assert result.color.shape == buffers.color.mean.shape
+    assert result.color.dtype == np.float32
+    assert np.isfinite(result.color).all()
+    assert result.color.min(initial=0) >= 0
+    assert (result.error is None) == (result.estimated_relmse is None)
+    if result.error is not None and result.estimated_relmse is not None:
+        assert result.error.shape == (*buffers.color.mean.shape[:2], 1)
+        assert np.isfinite(result.error).all()
+        assert result.error.min() >= 0
+        assert np.isfinite(result.estimated_relmse)
+
+
+def _halved(color: FloatImage, relative_noise: float, seed: int = 0) -> Buffer:
+    """Independent halves of a noise-free colour."""
+    rng = np.random.default_rng(seed)
+    half_a, half_b = (
+        (color * (1 + relative_noise * rng.standard_normal(color.shape))).astype(np.float32) for _ in range(2)
+    )
+    return Buffer((half_a + half_b) / 2, half_a, half_b)
+
+
+@pytest.mark.parametrize(
+    ("preset", "spp", "factor"),
+    [("draft", 4, 20), ("draft", 16, 20), ("draft", 64, 12), ("balanced", 16, 25), ("final", 16, 25)],
+)
+def test_error_falls_and_is_estimated(preset: str, spp: int, factor: float, make_render: MakeRender) -> None:
+    render = make_render(spp=spp)
+    result = denoise(render.buffers, _settings(preset=preset, iterations=60))
+    _check(result, render.buffers)
+    error = _rel_mse(result.color, render.reference)
+    assert error < _rel_mse(render.buffers.color.mean, render.reference) / factor
+    assert result.estimated_relmse is not None
+    assert error / 4 < result.estimated_relmse < 4 * error
+    assert result.iterations == 60
+    assert [point.iteration for point in result.history] == sorted(
+        point.iteration for point in result.history
+    )
+    assert result.history[-1].iteration == 60
+
+
+def test_mean_radiance_is_kept(make_render: MakeRender) -> None:
+    render = make_render(height=60, width=80, spp=16)
+    result = denoise(render.buffers, _settings())
+    assert result.color.mean() == pytest.approx(render.reference.mean(), rel=0.02)
+
+
+def test_same_seed_and_threads_same_bits(render: SyntheticRender) -> None:
+    first, again, other = (denoise(render.buffers, _settings(seed=seed)).color for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+@pytest.mark.parametrize("exponent", [-20, -3, 5, 30])
+def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: SyntheticRender) -> None:
+    scale = np.float32(2.0**exponent)
+    color = render.buffers.color
+    assert color.half_a is not None
+    assert color.half_b is not None
+    assert color.variance is not None
+    brighter = Buffer(
+        color.mean * scale, color.half_a * scale, color.half_b * scale, color.variance * scale**2
+    )
+    plain = denoise(render.buffers, _settings())
+    scaled = denoise(render.buffers.with_quantities(color=brighter), _settings())
+    np.testing.assert_array_equal(scaled.color, plain.color * scale)
+    assert scaled.estimated_relmse == plain.estimated_relmse
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 5), (33, 17)])
+@pytest.mark.parametrize("halves", [True, False])
+def test_any_size(size: tuple[int, int], halves: bool, make_render: MakeRender) -> None:
+    buffers = make_render(*size).buffers
+    if not halves:
+        buffers = buffers.with_quantities(color=Buffer(buffers.color.mean))
+    result = denoise(buffers, _settings(iterations=3))
+    _check(result, buffers)
+
+
+def test_an_empty_image_is_refused(make_render: MakeRender) -> None:
+    color = Buffer(np.empty((0, 5, 3), np.float32))
+    with pytest.raises(InputError, match="at least one pixel, got 5x0"):
+        denoise(RenderBuffers(color), _settings())
+
+
+def test_color_alone(render: SyntheticRender) -> None:
+    buffers = RenderBuffers(render.buffers.color)
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    assert any("no albedo, normal, depth" in note for note in result.notes)
+    noisy = _rel_mse(buffers.color.mean, render.reference)
+    assert _rel_mse(result.color, render.reference) < noisy / 1.4
+    without_halves = RenderBuffers(Buffer(buffers.color.mean))
+    result = denoise(without_halves, _settings())
+    _check(result, without_halves)
+    assert result.estimated_relmse is None
+
+
+@pytest.mark.parametrize("missing", ["albedo", "normal", "depth"])
+def test_a_missing_feature_is_noted(missing: str, render: SyntheticRender) -> None:
+    buffers = render.buffers.with_quantities(**{missing: None})
+    result = denoise(buffers, _settings(iterations=5))
+    _check(result, buffers)
+    assert any(note.startswith(f"no {missing}:") for note in result.notes)
+    assert not any(note.startswith("no ") for note in denoise(render.buffers, _settings(iterations=1)).notes)
+
+
+@pytest.mark.parametrize("variance", [True, False])
+def test_without_halves_there_is_no_estimate(variance: bool, render: SyntheticRender) -> None:
+    color = render.buffers.color
+    buffers = render.buffers.with_quantities(
+        color=Buffer(color.mean, variance=color.variance if variance else None)
+    )
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    assert result.estimated_relmse is None
+    assert any(note.startswith("no half buffers") for note in result.notes)
+    assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 8
+
+
+def test_copied_halves_score_nothing(render: SyntheticRender) -> None:
+    mean = render.buffers.color.mean
+    buffers = render.buffers.with_quantities(
+        color=Buffer(mean, mean, mean.copy(), render.buffers.color.variance)
+    )
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    assert result.estimated_relmse is None
+    assert any("not independent" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e12, 1e30])
+@pytest.mark.parametrize("halves", [True, False])
+def test_what_no_renderer_can_mean_stays_out(value: float, halves: bool, make_render: MakeRender) -> None:
+    buffers = make_render(20, 24).buffers
+    rng = np.random.default_rng(5)
+    broken = {}
+    for name, buffer in buffers.quantities():
+        planes = {plane: array.copy() for plane, array in buffer.planes()}
+        if name == "color" and not halves:
+            planes = {"mean": planes["mean"], "variance": planes["variance"]}
+        for array in planes.values():
+            array[rng.integers(20, size=3), rng.integers(24, size=3)] = value
+        broken[name] = Buffer(**planes)
+    result = denoise(buffers.with_quantities(**broken), _settings(iterations=5))
+    _check(result, buffers)
+
+
+@pytest.mark.parametrize("value", [1e12, 1e30, 3e38])
+def test_a_wild_albedo_is_not_smeared(value: float, render: SyntheticRender) -> None:
+    assert render.buffers.albedo is not None
+    planes = {name: array.copy() for name, array in render.buffers.albedo.planes()}
+    for name in ("mean", "half_a"):
+        planes[name][30, 40] = value
+    result = denoise(render.buffers.with_quantities(albedo=Buffer(**planes)), _settings())
+    _check(result, render.buffers)
+    noisy = _rel_mse(render.buffers.color.mean, render.reference)
+    assert _rel_mse(result.color, render.reference) < noisy / 4
+
+
+def test_a_firefly_leaves_no_blot(render: SyntheticRender) -> None:
+    color = render.buffers.color
+    assert color.half_a is not None
+    assert color.half_b is not None
+    half_a = color.half_a.copy()
+    half_a[8, 9] = 1e7
+    buffers = render.buffers.with_quantities(color=Buffer((half_a + color.half_b) / 2, half_a, color.half_b))
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    assert any("1 fireflies limited" in note for note in result.notes)
+    assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 4
+
+
+def test_black_stays_black(render: SyntheticRender) -> None:
+    black = np.zeros((12, 17, 3), np.float32)
+    for color in (Buffer(black, black, black, black), Buffer(black)):
+        buffers = RenderBuffers(color)
+        result = denoise(buffers, _settings(iterations=3))
+        _check(result, buffers)
+        np.testing.assert_array_equal(result.color, black)
+
+
+@pytest.mark.parametrize("relative_noise", [1e-4, 1e-3])
+def test_a_converged_image_is_left_nearly_alone(relative_noise: float, render: SyntheticRender) -> None:
+    # Shadows that no feature shows: any filter alone would blur them.
+    color = render.reference * (1 + 0.5 * np.sin(np.arange(56) * 0.9))[None, :, None]
+    buffers = render.buffers.with_quantities(color=_halved(color.astype(np.float32), relative_noise))
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    np.testing.assert_allclose(result.color, buffers.color.mean, rtol=1e-3)
+
+
+def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:
+    result = denoise(render.buffers, _settings(iterations=100_000, time_budget_s=1e-6))
+    _check(result, render.buffers)
+    assert result.iterations == 1
+    assert any("time budget" in note for note in result.notes)
+
+
+def test_the_target_error_ends_the_training(render: SyntheticRender) -> None:
+    result = denoise(render.buffers, _settings(iterations=100_000, target_error=0.5))
+    _check(result, render.buffers)
+    assert result.iterations < 100
+    assert any("target error" in note for note in result.notes)
+    assert result.history[-1].estimated_relmse is not None
+    assert result.history[-1].estimated_relmse <= 0.5
+
+
+def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRender) -> None:
+    raised = []
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("relMSE") and not raised:
+            raised.append(fraction)
+            raise KeyboardInterrupt
+
+    result = denoise(render.buffers, _settings(iterations=100_000), interrupt)
+    assert len(raised) == 1
+    _check(result, render.buffers)
+    assert any(note.startswith(f"interrupted at step {result.iterations}") for note in result.notes)
+    assert 1 <= result.iterations < 1000
+
+
+def test_progress_never_falls_and_ends_at_one(render: SyntheticRender) -> None:
+    for buffers in (render.buffers, RenderBuffers(Buffer(render.buffers.color.mean))):
+        told: list[float] = []
+        denoise(buffers, _settings(), lambda fraction, _, told=told: told.append(fraction))  # type: ignore[misc]
+        assert told == sorted(told)
+        assert told[-1] == 1
+
+
+def test_inputs_stay_as_they_are(render: SyntheticRender) -> None:
+    before = {
+        (name, plane): array.tobytes()
+        for name, buffer in render.buffers.quantities()
+        for plane, array in buffer.planes()
+    }
+    denoise(render.buffers, _settings(iterations=2))
+    for name, buffer in render.buffers.quantities():
+        for plane, array in buffer.planes():
+            assert array.tobytes() == before[name, plane]
+
+
+def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) -> None:
+    assert guidance_from_buffers(render.buffers, 1).features.shape == (40, 56, 7)
+
+    def flattened(name: str, channels: list[int]) -> Buffer:
+        planes = {}
+        for plane, array in getattr(render.buffers, name).planes():
+            planes[plane] = array.copy()
+            planes[plane][:, :, channels] = 0 if plane == "variance" else 0.25
+        return Buffer(**planes)
+
+    buffers = render.buffers.with_quantities(
+        albedo=flattened("albedo", [0, 1, 2]), normal=flattened("normal", [1]), depth=flattened("depth", [0])
+    )
+    guidance = guidance_from_buffers(buffers, 1)
+    assert guidance.features.shape == (40, 56, 2)
+    assert len(guidance.penalty) == 2
+    assert (np.ptp(guidance.features, axis=(0, 1)) > 0).all()
+    _check(denoise(buffers, _settings(iterations=2)), buffers)
+    channels = {"albedo": [0, 1, 2], "normal": [0, 1, 2], "depth": [0]}
+    nothing = render.buffers.with_quantities(**{name: flattened(name, of) for name, of in channels.items()})
+    assert guidance_from_buffers(nothing, 1).features.shape == (40, 56, 0)
+    _check(denoise(nothing, _settings(iterations=2)), nothing)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"iterations": 0},
+        {"iterations": -3},
+        {"time_budget_s": 0.0},
+        {"time_budget_s": float("nan")},
+        {"target_error": -1.0},
+        {"threads": 0},
+        {"channels": ()},
+        {"channels": (8, 0)},
+    ],
+)
+def test_settings_out_of_range_are_refused(changes: dict[str, Any]) -> None:
+    name = next(iter(changes))
+    with pytest.raises(InputError, match=rf"^{name}: expected"):
+        FitSettings(**changes)
+
+
+def test_settings_come_back_with_the_result(render: SyntheticRender) -> None:
+    settings = _settings(iterations=1, seed=9)
+    assert denoise(render.buffers, settings).settings == settings
+    assert replace(settings, seed=1) != settings
