@@ -212,6 +212,7 @@ def test_a_scene_that_cannot_be_loaded_is_one_line(write_scene, tmp_path, monkey
         with pytest.raises(InputError) as error:
             tungsten.render(path)
         assert str(path) in str(error.value)
+        assert "check" in str(error.value)
         assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="found none"):
         tungsten.render(tmp_path / "missing.json")

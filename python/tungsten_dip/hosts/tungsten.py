@@ -248,7 +248,9 @@ def _load(scene: Path, options: DriverOptions) -> Any:
             str(scene), threads=options.threads or 0, spp=options.spp, seed=options.seed, **paths
         )
     except RuntimeError as error:
-        raise InputError(f"{scene}: Tungsten cannot load it: {error}") from None
+        raise InputError(
+            f"{scene}: Tungsten cannot load it ({error}); check the scene and the files that it names"
+        ) from None
 
 
 def _render_passes(
