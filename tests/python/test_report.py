@@ -48,6 +48,11 @@ def result(render):
     )
 
 
+def test_a_note_that_was_logged_is_shown_once(render, result):
+    html = report_page("room", render.buffers, result, "filmic", ["mended 3 NaN", *result.notes])
+    assert html.count("no visibility: fitted without") == 1
+
+
 def test_the_page_shows_everything_and_needs_no_network(render, result):
     html = report_page("A <b>room</b>", render.buffers, result, "filmic", ["mended 3 NaN"])
     page = Page(html)

@@ -30,7 +30,8 @@ def report_page(
 ) -> str:
     """Return the page for one fit, its pictures displayed with one of Tungsten's tonemaps.
 
-    ``remarks`` are lines on the input (what was taken for what, what was mended); the fit's notes follow.
+    ``remarks`` are lines on the input (what was taken for what, what was mended); the fit's notes follow,
+    except for those that are among the remarks already.
     """
     template = Template(resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
     return template.substitute(
@@ -45,7 +46,7 @@ def report_page(
         false_colors=", ".join(f"rgb({r} {g} {b})" for r, g, b in FALSE_COLORS),
         curve=_curve(result.history),
         settings="".join(f"<tr><th>{name}</th><td>{value}</td></tr>" for name, value in _settings(result)),
-        notes=_bullets([*remarks, *result.notes]),
+        notes=_bullets(list(dict.fromkeys([*remarks, *result.notes]))),
     )
 
 
