@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
+
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
+
+_LOG = logging.getLogger(__name__)
 
 __all__ = ["FitResult", "FitSettings", "HistoryPoint", "denoise"]
 
@@ -36,10 +41,7 @@ def denoise(
     else:
         from tungsten_dip.fit.fusion import fit_fusion as fit
     result = fit(buffers, settings, progress)
-    return result if not mended else _with_notes(result, mended)
-
-
-def _with_notes(result: FitResult, notes: tuple[str, ...]) -> FitResult:
-    from dataclasses import replace
-
-    return replace(result, notes=(*notes, *result.notes))
+    result = replace(result, notes=(*mended, *result.notes))
+    for note in result.notes:
+        _LOG.info(note)
+    return result

@@ -9,7 +9,6 @@ scored half, so noise adds a constant to the loss and nothing to the image: the 
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from dataclasses import dataclass
@@ -38,8 +37,6 @@ from tungsten_dip.fit.pilots import (
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
 
-_LOG = logging.getLogger(__name__)
-
 RELMSE_EPSILON = 0.01
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
@@ -63,7 +60,7 @@ _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
 _HIDDEN = 16
-_BATCH_PIXELS = 1 << 15
+_BATCH_PIXELS = 1 << 14
 _LEARNING_RATE = 1e-2
 _WARM_UP_STEPS = 10
 _HEAD_START = 1.0
@@ -73,7 +70,7 @@ _CHUNK_PIXELS = 1 << 18
 _HISTORY_EVERY = 20
 _HISTORY_PIXELS = 1 << 16
 _ERROR_RADIUS = 4
-_SURE = 0.1
+_SURE = 0.35
 """Relative standard error of an estimated relMSE up to which it is believed."""
 
 
@@ -132,7 +129,8 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
         notes.append(fireflies)
     fit = _Fit(halves, guidance, settings, started)
     fit.add_pilots(variance, progress)
-    with compute_device(settings) as device:
+    # The network is too small to share: on a busy machine threads would only wait for one another.
+    with compute_device(settings, most_threads=1) as device:
         notes += fit.train(device, progress)
         image, error, estimate = fit.result(device)
 
@@ -144,8 +142,6 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, estimate = scaled(color.mean) if fireflies is None else noisy, noisy_estimate
         error = _core.box_mean(noise_of_input.mean(axis=2, keepdims=True), _ERROR_RADIUS, threads)
-    for note in notes:
-        _LOG.info(note)
     return FitResult(
         color=image / np.float32(scale),
         settings=settings,

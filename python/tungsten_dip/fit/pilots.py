@@ -51,6 +51,8 @@ class Pilot:
 
 
 FIRST_GUIDE = Pilot(radius=3)
+FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
+"""Where no feature shows an edge, a window blurs every one within it."""
 
 # In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
 # shadows and reflections, which no feature shows; a regression on the position follows gradients.
@@ -90,7 +92,7 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
     if filtered.albedo is not None:
         mean = filtered.albedo.mean
         scaled.append((np.clip(mean, 0, 1), _ALBEDO_PENALTY))
-        black = mean.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
+        black = mean.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
         # Well above 1 it is light that a surface emits, which the colour must show too. What the colour does
         # not show is a wild value, and would be smeared over its surroundings.
         bounded = np.clip(mean, 0, 2 * np.maximum(buffers.color.mean, 1))
@@ -124,7 +126,8 @@ def first_pilots(
     ``variance`` (of the mean, same shape) says how noisy it is, and its own residual does where it is None.
     """
     irradiances = tuple(color / guidance.albedo for color in colors)
-    guides = tuple(np.maximum(_regress(image, FIRST_GUIDE, guidance), 0) for image in irradiances)
+    first = FIRST_GUIDE if guidance.penalty else FIRST_GUIDE_WITHOUT_FEATURES
+    guides = tuple(np.maximum(_regress(image, first, guidance), 0) for image in irradiances)
     guides, noise = _guides(guides, irradiances, variance, guidance)
     second = Pilot(radius=7, k=1.0)
     guides = tuple(

@@ -62,10 +62,11 @@ class HistoryPoint:
 class FitResult:
     """A denoised image and what is known about it.
 
-    ``color`` is linear radiance, float32, shape (height, width, 3). ``error`` is the estimated squared error
-    relative to the squared radiance (relMSE, epsilon 0.01) of every pixel, shape (height, width, 1); its mean
-    is ``estimated_relmse``. Both are None where the buffers hold no independent evidence to estimate them
-    from. ``notes`` says in one line each what evidence was missing and what that meant.
+    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE (with
+    epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error of every
+    pixel, shape (height, width, 1), smoothed and never below what is noise in it, so that its mean is the
+    larger. Both are None where the buffers hold no independent evidence to estimate them from. ``notes`` says
+    in one line each what evidence was missing and what that meant.
     """
 
     color: FloatImage
