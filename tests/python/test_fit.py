@@ -195,7 +195,7 @@ def test_a_firefly_leaves_no_blot(render: SyntheticRender) -> None:
     buffers = render.buffers.with_quantities(color=Buffer((half_a + color.half_b) / 2, half_a, color.half_b))
     result = denoise(buffers, _settings())
     _check(result, buffers)
-    assert any("1 fireflies limited" in note for note in result.notes)
+    assert any("1 firefly limited" in note for note in result.notes)
     assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 4
 
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args, get_type_hints
 
-from tungsten_dip.buffers import RenderBuffers, replacing, sanitize
+from tungsten_dip.buffers import RenderBuffers, replacing
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
 from tungsten_dip.report.page import report_page
-
-log = logging.getLogger(__name__)
 
 FIT_OPTIONS = ("preset", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -38,14 +35,11 @@ def fit_settings(options: argparse.Namespace, names: Sequence[str]) -> FitSettin
 
 
 def denoise_with_progress(buffers: RenderBuffers, settings: FitSettings) -> FitResult:
-    """Mend the buffers, denoise them and show progress on stderr."""
+    """Denoise the buffers and show progress on stderr."""
     from tungsten_dip.fit import denoise  # imports torch
 
-    mended, lines = sanitize(buffers, settings.threads)
-    for line in lines:
-        log.warning(line)
     with progress_on_stderr("denoising") as progress:
-        return denoise(mended, settings, progress)
+        return denoise(buffers, settings, progress)
 
 
 def write_report(

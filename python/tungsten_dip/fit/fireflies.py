@@ -8,8 +8,11 @@ from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8
-_LIMIT = 30.0
+_LIMIT = 15.0
 """How many times brighter than its surroundings a pixel may be that only one half of the samples shows so."""
+
+_LIMIT_OF_OTHER = 4.0
+"""How many times brighter than in the other half: what is there at all, both halves show about alike."""
 
 _ROUNDS = 40
 _SETTLED = 0.9
@@ -24,15 +27,15 @@ def limit_fireflies(
 ) -> tuple[tuple[FloatImage, FloatImage], str | None]:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    What is bright in both halves is left alone, whatever its radiance, and so is everything up to 30 times
-    the mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if
+    What both halves show about alike is left alone, whatever its radiance, and so is everything up to 15
+    times the mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if
     anything.
     """
     levels = [half.mean(axis=2, keepdims=True, dtype=np.float64) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)
     limited, taken, pixels = [], 0.0, 0
     for half, level, other in zip((half_a, half_b), levels, levels[::-1], strict=True):
-        limit = _LIMIT * np.maximum(around, other)
+        limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other)
         over = level > limit
         factor = np.where(over, limit / np.where(over, level, 1), 1)
         limited.append(half * factor.astype(np.float32))
@@ -41,7 +44,7 @@ def limit_fireflies(
     if pixels == 0:
         return (half_a, half_b), None
     total = float(levels[0].sum() + levels[1].sum())
-    note = f"{pixels} fireflies limited, with {100 * taken / total:.2g}% of the image's energy"
+    note = f"{pixels} {'firefly' if pixels == 1 else 'fireflies'} limited, with {100 * taken / total:.3g}% of the image's energy"
     return (limited[0], limited[1]), note
 
 

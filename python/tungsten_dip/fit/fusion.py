@@ -136,7 +136,7 @@ def fit_fusion(buffers: RenderBuffers, settings: FitSettings, progress: Progress
 
     # The error of the plain mean, by the same evidence.
     noisy = np.float32(0.5) * (halves[0] + halves[1])
-    noise_of_input = (halves[0] - halves[1]) ** 2 / 4 / (noisy**2 + np.float32(RELMSE_EPSILON))
+    noise_of_input = (halves[0] - halves[1]) ** 2 / 4 / (image**2 + np.float32(RELMSE_EPSILON))
     noisy_estimate = float(noise_of_input.mean(dtype=np.float64))
     if estimate >= noisy_estimate:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
