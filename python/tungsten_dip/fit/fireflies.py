@@ -44,7 +44,8 @@ def limit_fireflies(
     if pixels == 0:
         return (half_a, half_b), None
     total = float(levels[0].sum() + levels[1].sum())
-    note = f"{pixels} {'firefly' if pixels == 1 else 'fireflies'} limited, with {100 * taken / total:.3g}% of the image's energy"
+    noun = "firefly" if pixels == 1 else "fireflies"
+    note = f"{pixels} {noun} limited, with {100 * taken / total:.3g}% of the image's energy"
     return (limited[0], limited[1]), note
 
 
