@@ -59,6 +59,7 @@ _OUTLIER = 20.0
 _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
+_LEAST_SPREAD = 1e-6
 _HIDDEN = 16
 _BATCH_PIXELS = 1 << 14
 _LEARNING_RATE = 1e-2
@@ -253,43 +254,42 @@ class _Fit:
         mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
         self._best = 1 + int(np.argmin(mean_errors))
 
-        weights = [
-            1
-            / (
-                denominators[half]
-                * (
-                    _LEAST_NOISE
-                    + mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
-                )
-            )
-            for half in (0, 1)
+        noises = [
+            mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[self._best]
         ]
-        self._weight = torch.from_numpy(np.stack(weights).astype(np.float32)).reshape(2, pixels, 1)
+        weights = [1 / (d * (_LEAST_NOISE + noise)) for d, noise in zip(denominators, noises, strict=True)]
+        self._weight = torch.from_numpy(np.stack(weights)).reshape(2, pixels, 1)
 
-        per_half = []
+        # Filled column by column: the inputs are the largest array of a fit.
+        features = self._guidance.features
+        columns = features.shape[2] + 2 + (count - 1) * (1 + len(_SCORE_RADII))
+        inputs = np.empty((2, pixels, columns), np.float32)
         for half in (0, 1):
-            noise = mean_around(_capped(errors[self._best][half], threads), _NOISE_RADIUS, threads)
-            cap = _OUTLIER * noise + np.float32(1e-3)
-            reference = np.minimum(errors[self._best][half], cap)
-            columns = [self._guidance.features, np.log(noise + np.float32(1e-4))]
+            noise, half_inputs = noises[half], iter(inputs[half].T)
+            for channel in range(features.shape[2]):
+                next(half_inputs)[:] = features[:, :, channel].ravel()
+            next(half_inputs)[:] = np.log(noise + np.float32(1e-4)).ravel()
             base = _log_level(self._pilots[self._best][half])
-            columns.append(base)
-            for index, pilot in enumerate(self._pilots):
+            next(half_inputs)[:] = base.ravel()
+            cap = np.float32(_OUTLIER) * noise + np.float32(1e-3)
+            reference = np.minimum(errors[self._best][half], cap)
+            for index in range(count):
                 if index == self._best:
                     continue
-                columns.append(np.clip(_log_level(pilot[half]) - base, -2, 2))
+                brighter = _log_level(self._pilots[index][half]) - base
+                next(half_inputs)[:] = np.clip(brighter, -2, 2).ravel()
                 worse = np.minimum(errors[index][half], cap) - reference
                 for radius in _SCORE_RADII:
                     score = mean_around(worse, radius, threads) / (
                         np.float32(0.05) * noise + np.float32(1e-4)
                     )
-                    columns.append(np.clip(score, -3, 3))
-            per_half.append(np.concatenate(columns, axis=2).reshape(pixels, -1))
-        inputs = torch.from_numpy(np.stack(per_half))
-        mean = inputs.mean((0, 1))
-        spread = inputs.std((0, 1), correction=0)
-        varying = spread > 1e-6
-        self._inputs = ((inputs[..., varying] - mean[varying]) / spread[varying]).clamp(-4, 4)
+                    next(half_inputs)[:] = np.clip(score, -3, 3).ravel()
+        for column in range(columns):
+            plane = inputs[:, :, column]
+            plane -= plane.mean(dtype=np.float64)
+            plane /= max(float(plane.std(dtype=np.float64)), _LEAST_SPREAD)
+            np.clip(plane, -4, 4, out=plane)
+        self._inputs = torch.from_numpy(inputs)
 
     def _fuse(self, half: Tensor | int, pixel: Tensor | slice, device: torch.device) -> Tensor:
         logits = self._network(self._inputs[half, pixel].to(device))
