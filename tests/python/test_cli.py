@@ -540,3 +540,12 @@ def test_a_bare_number_means_minutes_to_tungsten():
 def test_texts_that_are_no_duration(text):
     with pytest.raises(Exception, match="expected a duration"):
         duration(text)
+
+
+def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
+    monkeypatch.setattr("tungsten_dip.fit.find_spec", lambda name: None)
+    assert tungsten.main(["--dip-denoise", "-d", str(tmp_path / "out"), str(scene)]) == 2
+    captured = capfd.readouterr()
+    assert "pip install 'tungsten-dip[fit]'" in captured.err
+    assert "Traceback" not in captured.err
+    assert not (tmp_path / "out").exists()

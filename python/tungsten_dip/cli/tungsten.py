@@ -21,7 +21,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit import FitSettings, require_torch
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.progress import Progress
 from tungsten_dip.report.preview import side_by_side
@@ -74,6 +74,8 @@ def _run(arguments: Sequence[str] | None) -> None:
         for name in (*FIT_OPTIONS, "report", "dip_preview"):
             if getattr(options, name) not in (None, False):
                 raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
+    else:
+        require_torch()
     for name in ("output_file", "hdr_output_file", "report"):
         path, count = getattr(options, name), len(options.scenes)
         if path is not None and count > 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from importlib.util import find_spec
 
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
@@ -13,7 +14,13 @@ from tungsten_dip.progress import Progress, silent
 
 _LOG = logging.getLogger(__name__)
 
-__all__ = ["FitResult", "FitSettings", "HistoryPoint", "denoise"]
+__all__ = ["FitResult", "FitSettings", "HistoryPoint", "denoise", "require_torch"]
+
+
+def require_torch() -> None:
+    """Raise InputError if torch is not installed, without importing it: a render may come before the fit."""
+    if find_spec("torch") is None:
+        raise InputError("fitting needs torch; install it with: pip install 'tungsten-dip[fit]'")
 
 
 def denoise(
@@ -31,10 +38,7 @@ def denoise(
     settings = settings or FitSettings()
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
-    try:
-        import torch  # noqa: F401
-    except ImportError:
-        raise InputError("fitting needs torch; install it with: pip install 'tungsten-dip[fit]'") from None
+    require_torch()
     buffers, mended = sanitize(buffers, settings.threads)
     if settings.preset == "paper":
         from tungsten_dip.fit.paper import fit_paper as fit
