@@ -91,7 +91,8 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
     albedo = np.ones(shape, np.float32)
     if filtered.albedo is not None:
         mean = filtered.albedo.mean
-        scaled.append((np.clip(mean, 0, 1), _ALBEDO_PENALTY))
+        # Above 1 it is emission, which must not mix with what it lights, but may be brighter by any factor.
+        scaled.append((np.clip(mean, 0, 1) + np.log(np.maximum(mean, 1)), _ALBEDO_PENALTY))
         black = mean.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
         # Well above 1 it is light that a surface emits, which the colour must show too. What the colour does
         # not show is a wild value, and would be smeared over its surroundings.
