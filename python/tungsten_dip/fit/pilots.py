@@ -30,6 +30,9 @@ _LEAST_ALBEDO = 0.01
 _BLACK_ALBEDO = 1e-3
 """Below it a surface's colour cannot come from its albedo (a specular one, say) and is not divided by it."""
 
+_BRIGHTEST_ALBEDO = 1e6
+"""Brighter light, in the renderer's units, looks the same to the regression."""
+
 _GUIDE_OFFSET = 0.05
 """Guides are compared as log(radiance + offset), where the eye stops to see noise as relative."""
 
@@ -91,12 +94,13 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
     albedo = np.ones(shape, np.float32)
     if filtered.albedo is not None:
         mean = filtered.albedo.mean
-        # Above 1 it is emission, which must not mix with what it lights, but may be brighter by any factor.
-        scaled.append((np.clip(mean, 0, 1) + np.log(np.maximum(mean, 1)), _ALBEDO_PENALTY))
         black = mean.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
         # Well above 1 it is light that a surface emits, which the colour must show too. What the colour does
         # not show is a wild value, and would be smeared over its surroundings.
         bounded = np.clip(mean, 0, 2 * np.maximum(buffers.color.mean, 1))
+        # Light must not mix with what it lights, but may be brighter by any factor.
+        brightness = np.log(np.clip(mean, 1, _BRIGHTEST_ALBEDO))
+        scaled.append((np.clip(mean, 0, 1) + brightness, _ALBEDO_PENALTY))
         albedo = np.where(black, np.float32(1), bounded + np.float32(_LEAST_ALBEDO))
     if filtered.normal is not None:
         scaled.append((np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
