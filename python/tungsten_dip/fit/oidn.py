@@ -1,0 +1,78 @@
+"""Intel Open Image Denoise, which was trained on many images: a peer to compare with, and a guide.
+
+Afra, "Intel Open Image Denoise", https://www.openimagedenoise.org; through the package ``pyoidn``, on the CPU.
+"""
+
+from __future__ import annotations
+
+import logging
+from importlib.util import find_spec
+from typing import Literal
+
+import numpy as np
+
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.errors import InputError
+
+_LOG = logging.getLogger(__name__)
+
+Quality = Literal["fast", "balanced", "high"]
+
+
+def require_oidn() -> None:
+    """Raise InputError if pyoidn is not installed, without importing it."""
+    if find_spec("pyoidn") is None:
+        raise InputError("Open Image Denoise needs pyoidn; install it with: pip install 'tungsten-dip[oidn]'")
+
+
+def oidn_image(
+    color: FloatImage,
+    albedo: FloatImage | None = None,
+    normal: FloatImage | None = None,
+    *,
+    quality: Quality = "high",
+    threads: int | None = None,
+) -> FloatImage:
+    """Return what Open Image Denoise makes of one image, in its HDR mode.
+
+    All images are float32 of shape (height, width, 3): linear radiance, albedo (clipped to [0, 1] in there)
+    and normals in [-1, 1], as noisy as they were rendered. Values that are not finite are mended first, the
+    arguments are not modified. Normals are of use to it beside an albedo alone; without one they are left
+    out, and the log says so. ``threads`` None uses every core. The result is finite linear radiance.
+
+    Raises InputError if the image is empty, the shapes differ, pyoidn is not installed, or the processor is
+    not one that Open Image Denoise supports.
+    """
+    if color.size == 0:
+        raise InputError(f"expected an image of at least one pixel, got one of shape {color.shape}")
+    require_oidn()
+    import pyoidn
+
+    if normal is not None and albedo is None:
+        _LOG.info("Open Image Denoise takes normals only beside an albedo: the normals are left out")
+        normal = None
+    given = {"color": color, "albedo": albedo, "normal": normal}
+    buffers = {name: Buffer(np.ascontiguousarray(x)) for name, x in given.items() if x is not None}
+    mended, _ = sanitize(RenderBuffers(**buffers), threads)
+    images = {name: buffer.mean for name, buffer in mended.quantities()}
+    images["output"] = np.empty_like(images["color"])
+    qualities = {
+        "fast": pyoidn.OIDN_QUALITY_FAST,
+        "balanced": pyoidn.OIDN_QUALITY_BALANCED,
+        "high": pyoidn.OIDN_QUALITY_HIGH,
+    }
+    with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
+        device.set_int("numThreads", threads or 0)
+        device.commit()
+        with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT) as denoiser:
+            for name, image in images.items():
+                denoiser.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+            denoiser.set_bool("hdr", True)
+            denoiser.set_quality(qualities[quality])
+            denoiser.commit()
+            denoiser.execute()
+        error = device.get_error()
+    if error is not None:
+        raise InputError(f"Open Image Denoise: {' '.join(error.split())}; use another method on this machine")
+    return images["output"]

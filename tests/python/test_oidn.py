@@ -1,0 +1,81 @@
+import logging
+
+import numpy as np
+import pytest
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit import oidn
+
+
+def image(render, *, albedo=True, normal=True, **options):
+    buffers = render.buffers
+    return oidn.oidn_image(
+        buffers.color.mean,
+        buffers.albedo.mean if albedo else None,
+        buffers.normal.mean if normal else None,
+        **options,
+    )
+
+
+@pytest.fixture(autouse=True)
+def _needs_pyoidn(request):
+    if "without_pyoidn" not in request.fixturenames:
+        pytest.importorskip("pyoidn", reason="pyoidn is not installed")
+
+
+@pytest.fixture
+def without_pyoidn(monkeypatch):
+    monkeypatch.setattr(oidn, "find_spec", lambda name: None)
+
+
+@pytest.mark.parametrize("quality", ["fast", "balanced", "high"])
+def test_it_removes_most_of_the_noise_and_keeps_the_input(render, quality):
+    planes = [buffer.mean for _, buffer in render.buffers.quantities()]
+    before = [plane.copy() for plane in planes]
+    denoised = image(render, quality=quality)
+    assert denoised.dtype == np.float32
+    errors = [np.mean((x - render.reference) ** 2) for x in (render.buffers.color.mean, denoised)]
+    assert errors[1] < 0.3 * errors[0]
+    for plane, kept in zip(planes, before, strict=True):
+        np.testing.assert_array_equal(plane, kept)
+
+
+def test_features_change_the_result_and_threads_do_not(render):
+    guided = image(render)
+    np.testing.assert_allclose(image(render, threads=1), guided, atol=1e-5)
+    without = [image(render, normal=False), image(render, albedo=False, normal=False)]
+    assert all(np.abs(other - guided).max() > 1e-3 for other in without)
+
+
+def test_normals_alone_are_left_out_and_that_is_said(render, caplog):
+    with caplog.at_level(logging.INFO):
+        alone = image(render, albedo=False)
+    assert "normals are left out" in caplog.text
+    np.testing.assert_array_equal(alone, image(render, albedo=False, normal=False))
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 9), (5, 3)])
+def test_any_size_is_possible_but_none(height, width):
+    color = np.random.default_rng(0).random((height, width, 3), dtype=np.float32)
+    assert oidn.oidn_image(color, color, color).shape == color.shape
+    with pytest.raises(InputError, match="at least one pixel"):
+        oidn.oidn_image(color[:0])
+
+
+def test_wild_values_are_mended_before(render):
+    color = render.buffers.color.mean.copy()
+    color[3, 4], color[5, 6], color[7] = np.nan, np.inf, -2
+    albedo = np.where(np.arange(56)[:, None] % 9 == 0, np.float32(np.nan), render.buffers.albedo.mean)
+    denoised = oidn.oidn_image(color, np.asfortranarray(albedo), render.buffers.normal.mean)
+    assert np.isfinite(denoised).all()
+    assert denoised.min() >= 0
+
+
+def test_images_of_other_sizes_are_refused(render):
+    with pytest.raises(InputError, match="albedo mean: expected"):
+        oidn.oidn_image(render.buffers.color.mean, render.buffers.albedo.mean[1:])
+
+
+def test_without_the_package_the_command_that_installs_it_is_told(render, without_pyoidn):
+    with pytest.raises(InputError, match=r"pip install 'tungsten-dip\[oidn\]'"):
+        image(render)
