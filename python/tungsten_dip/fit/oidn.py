@@ -1,6 +1,6 @@
 """Intel Open Image Denoise, which was trained on many images: a peer to compare with, and a guide.
 
-Afra, "Intel Open Image Denoise", https://www.openimagedenoise.org; through the package ``pyoidn``, on the CPU.
+https://www.openimagedenoise.org, through the package ``pyoidn``, on the CPU.
 """
 
 from __future__ import annotations
@@ -52,9 +52,13 @@ def oidn_image(
     if normal is not None and albedo is None:
         _LOG.info("Open Image Denoise takes normals only beside an albedo: the normals are left out")
         normal = None
-    given = {"color": color, "albedo": albedo, "normal": normal}
-    buffers = {name: Buffer(np.ascontiguousarray(x)) for name, x in given.items() if x is not None}
-    mended, _ = sanitize(RenderBuffers(**buffers), threads)
+    color_buffer = Buffer(np.ascontiguousarray(color))
+    features = {
+        name: Buffer(np.ascontiguousarray(feature))
+        for name, feature in (("albedo", albedo), ("normal", normal))
+        if feature is not None
+    }
+    mended, _ = sanitize(RenderBuffers(color_buffer).with_quantities(**features), threads)
     images = {name: buffer.mean for name, buffer in mended.quantities()}
     images["output"] = np.empty_like(images["color"])
     qualities = {
