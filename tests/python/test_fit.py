@@ -218,6 +218,53 @@ def test_a_converged_image_is_left_nearly_alone(relative_noise: float, render: S
     np.testing.assert_allclose(result.color, buffers.color.mean, rtol=1e-3)
 
 
+def test_the_halves_of_the_result_are_what_its_mean_is_made_of(render: SyntheticRender) -> None:
+    result = denoise(render.buffers, _settings())
+    assert result.halves is not None
+    np.testing.assert_allclose((result.halves[0] + result.halves[1]) / 2, result.color, rtol=1e-6, atol=1e-7)
+    assert (result.halves[0] != result.halves[1]).any()
+    assert denoise(RenderBuffers(Buffer(render.buffers.color.mean)), _settings()).halves is None
+
+
+def test_a_good_candidate_is_chosen(render: SyntheticRender) -> None:
+    alone = denoise(render.buffers, _settings())
+    truth = render.reference
+    together = denoise(render.buffers, _settings(), candidates=[(truth, truth)])
+    _check(together, render.buffers)
+    assert _rel_mse(together.color, truth) < _rel_mse(alone.color, truth) / 2
+
+
+def test_a_bad_candidate_does_little_harm(render: SyntheticRender) -> None:
+    alone = denoise(render.buffers, _settings())
+    wrong = np.full_like(render.reference, -1.0)
+    together = denoise(render.buffers, _settings(), candidates=[(wrong, 10 * render.reference)])
+    _check(together, render.buffers)
+    assert _rel_mse(together.color, render.reference) < 1.3 * _rel_mse(alone.color, render.reference)
+
+
+def test_candidates_without_halves_are_noted(render: SyntheticRender) -> None:
+    truth = render.reference
+    buffers = render.buffers.with_quantities(color=Buffer(render.buffers.color.mean))
+    result = denoise(buffers, _settings(), candidates=[(truth, truth)])
+    assert any(note.startswith("the candidates are not used") for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "message"),
+    [
+        ([(np.zeros((40, 56, 3)), np.zeros((56, 40, 3)))], "candidate 0, half B: expected shape"),
+        ([(np.zeros((40, 56, 3)),)], "candidate 0: expected a pair"),
+        ([(np.full((40, 56, 3), np.nan), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
+        ([(np.full((40, 56, 3), 1e300), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
+    ],
+)
+def test_candidates_that_cannot_be_used_are_refused(
+    candidates: Any, message: str, render: SyntheticRender
+) -> None:
+    with pytest.raises(InputError, match=message):
+        denoise(render.buffers, _settings(), candidates=candidates)
+
+
 def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:
     result = denoise(render.buffers, _settings(iterations=100_000, time_budget_s=1e-6))
     _check(result, render.buffers)

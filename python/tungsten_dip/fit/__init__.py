@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.evidence import checked_candidates
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
 
@@ -24,7 +26,10 @@ def require_torch() -> None:
 
 
 def denoise(
-    buffers: RenderBuffers, settings: FitSettings | None = None, progress: Progress = silent
+    buffers: RenderBuffers,
+    settings: FitSettings | None = None,
+    progress: Progress = silent,
+    candidates: Sequence[tuple[FloatImage, FloatImage]] = (),
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 
@@ -33,18 +38,31 @@ def denoise(
     threads and machine give the same bits. Ctrl-C during the training of the network ends it early with what
     was reached.
 
-    Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is.
+    ``candidates`` are further guesses at the clean image, made by somebody else (another denoiser, say, or
+    the previous frame moved into place): pairs of linear radiance in the shape of the colour, one image for
+    half A of the samples and one for half B, neither of which may know anything of the other half. The
+    network chooses among them and its own. Without independent halves nothing can score them: they are not
+    used.
+
+    Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is, or
+    candidates are of another shape or not finite.
     """
     settings = settings or FitSettings()
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     require_torch()
+    given = checked_candidates(buffers, candidates)
     buffers, mended = sanitize(buffers, settings.threads)
     if settings.preset == "paper":
-        from tungsten_dip.fit.paper import fit_paper as fit
+        if given:
+            raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
+        from tungsten_dip.fit.paper import fit_paper
+
+        result = fit_paper(buffers, settings, progress)
     else:
-        from tungsten_dip.fit.fusion import fit_fusion as fit
-    result = fit(buffers, settings, progress)
+        from tungsten_dip.fit.fusion import fit_fusion
+
+        result = fit_fusion(buffers, settings, progress, given)
     result = replace(result, notes=(*mended, *result.notes))
     for note in result.notes:
         _LOG.info(note)

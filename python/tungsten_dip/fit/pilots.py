@@ -39,6 +39,8 @@ _GUIDE_OFFSET = 0.05
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
+_CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
+
 _SAMPLES_OF_FIRST_WINDOW = 12
 """About how many independent neighbours the 7x7 window of the first guide averages, used without halves."""
 
@@ -77,10 +79,13 @@ class Guidance:
     """What all pilots share: features to regress on and the albedo that divides the colour.
 
     ``features`` has shape (height, width, n), noise-reduced, scaled, without those that are the same in
-    every pixel; ``penalty`` one value for each. ``albedo`` has shape (height, width, 3), never 0.
+    every pixel, called ``names``; ``penalty`` one value for each. ``left_out`` holds the value of each of the
+    others. ``albedo`` has shape (height, width, 3), never 0.
     """
 
     features: FloatImage
+    names: tuple[str, ...]
+    left_out: dict[str, float]
     penalty: tuple[float, ...]
     albedo: FloatImage
     threads: int
@@ -90,7 +95,7 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
     """Pre-filter, scale and select the features of sanitised buffers."""
     filtered = prefilter_features(buffers, threads)
     shape = buffers.color.mean.shape
-    scaled: list[tuple[FloatImage, float]] = []
+    scaled: list[tuple[str, FloatImage, float]] = []
     albedo = np.ones(shape, np.float32)
     if filtered.albedo is not None:
         mean = filtered.albedo.mean
@@ -100,26 +105,27 @@ def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
         bounded = np.clip(mean, 0, 2 * np.maximum(buffers.color.mean, 1))
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(mean, 1, _BRIGHTEST_ALBEDO))
-        scaled.append((np.clip(mean, 0, 1) + brightness, _ALBEDO_PENALTY))
+        scaled.append(("albedo", np.clip(mean, 0, 1) + brightness, _ALBEDO_PENALTY))
         albedo = np.where(black, np.float32(1), bounded + np.float32(_LEAST_ALBEDO))
     if filtered.normal is not None:
-        scaled.append((np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
+        scaled.append(("normal", np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
     if filtered.depth is not None:
         depth = filtered.depth.mean
         hit = depth[depth > 0]
         # Bounded for any unit of length; near and far surfaces stay apart.
         typical = np.float32(np.median(hit)) if hit.size else np.float32(1)
-        scaled.append((np.float32(_DEPTH_SCALE) * depth / (depth + typical), _DEPTH_PENALTY))
-    planes = [
-        (image[:, :, channel], penalty)
-        for image, penalty in scaled
-        for channel in range(image.shape[2])
-        if image[:, :, channel].size and np.ptp(image[:, :, channel]) > 0
-    ]
-    features = (
-        np.stack([plane for plane, _ in planes], axis=2) if planes else np.empty((*shape[:2], 0), np.float32)
-    )
-    return Guidance(features, tuple(penalty for _, penalty in planes), albedo, threads)
+        scaled.append(("depth", np.float32(_DEPTH_SCALE) * depth / (depth + typical), _DEPTH_PENALTY))
+    planes = {
+        f"{name}.{channel}": (image[:, :, index], penalty)
+        for name, image, penalty in scaled
+        for index, channel in enumerate(_CHANNELS[name])
+    }
+    left_out = {name: float(plane[0, 0]) for name, (plane, _) in planes.items() if np.ptp(plane) == 0}
+    names = tuple(name for name in planes if name not in left_out)
+    features = np.empty((*shape[:2], len(names)), np.float32)
+    for index, name in enumerate(names):
+        features[:, :, index] = planes[name][0]
+    return Guidance(features, names, left_out, tuple(planes[name][1] for name in names), albedo, threads)
 
 
 def first_pilots(

@@ -65,8 +65,9 @@ class FitResult:
     ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE (with
     epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error of every
     pixel, shape (height, width, 1), smoothed and never below what is noise in it, so that its mean is the
-    larger. Both are None where the buffers hold no independent evidence to estimate them from. ``notes`` says
-    in one line each what evidence was missing and what that meant.
+    larger. ``halves`` is what was made of half A of the samples alone and of half B alone, in the units and
+    shape of ``color``, which is their mean (but for fireflies). These are None where the buffers hold no
+    independent evidence. ``notes`` says in one line each what evidence was missing and what that meant.
     """
 
     color: FloatImage
@@ -75,5 +76,6 @@ class FitResult:
     iterations: int
     error: FloatImage | None = None
     estimated_relmse: float | None = None
+    halves: tuple[FloatImage, FloatImage] | None = None
     history: tuple[HistoryPoint, ...] = ()
     notes: tuple[str, ...] = field(default=())

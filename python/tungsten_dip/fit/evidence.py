@@ -1,0 +1,410 @@
+"""What is computed of an image before and after the network of the presets draft, balanced and final.
+
+Before: pilots of both halves, and planes that say of every pixel what its features are, what the pilots say,
+and how well each pilot of one half predicts the other half in the pixels around it (never in the pixel
+itself, whose noise it is scored by: the blind spot of Krull et al. 2019, "Noise2Void"). After: the image, its
+error, and whether it is better than its input. All that learns lies between (`fusion`, or onnxruntime alone
+in `tungsten_dip.onnx`); nothing here needs torch.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.statistics import halves_independent
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit.neighbours import mean_around
+from tungsten_dip.fit.pilots import Guidance, Pilot, first_pilots, guidance_from_buffers, pilot_images
+from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.progress import Progress
+
+Array = npt.NDArray[np.float32]
+
+Halves = tuple[FloatImage, FloatImage]
+"""An image made of half A of the samples alone, and one made of half B alone; shape (height, width, 3)."""
+
+RELMSE_EPSILON = 0.01
+_TYPICAL_RADIANCE = 0.25
+"""Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
+
+_BRIGHTEST = 1e15
+"""Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
+
+_ONLY_PILOT = Pilot(9, k=1.0)
+"""Used alone where nothing can score the pilots."""
+
+_CONVERGED = 1e-5
+"""relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
+
+_LOG_OFFSET = 0.02
+_SCORE_RADII = (2, 4, 8)
+_NOISE_RADIUS = 8
+_OUTLIER = 20.0
+"""A squared error this many times the local mean is an outlier: capped where it tells of a place's noise."""
+
+_LEAST_NOISE = 1.0
+"""Relative variance of one half's pixel below which less noise does not make a pixel count more."""
+
+_LEAST_SPREAD = 1e-6
+_LARGEST_INPUT = 4.0
+_ERROR_RADIUS = 4
+_SURE = 0.35
+"""Relative standard error of an estimated relMSE up to which it is believed."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
+
+    ``mean`` is the noisy image, without fireflies.
+    ``pilots`` holds what each pilot makes of both halves: first the noisy halves themselves, then what
+    ``computed`` describes, then the candidates that were handed in. ``reference`` is the index of the pilot
+    that the others are compared with. ``noises`` is the relative squared difference, shape (height, width,
+    1), of that pilot and the half that it has not seen, in the pixels around each.
+    """
+
+    scale: float
+    mean: FloatImage
+    guidance: Guidance
+    computed: tuple[Pilot, ...]
+    pilots: tuple[Halves, ...]
+    reference: int
+    noises: Halves
+    notes: tuple[str, ...]
+
+    @property
+    def halves(self) -> Halves:
+        """The noisy halves."""
+        return self.pilots[0]
+
+
+def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> tuple[Halves, ...]:
+    """Return the candidates as float32.
+
+    Raises InputError if one is not a pair of images of the colour's shape, or holds NaN or Inf.
+    """
+    expected = buffers.color.mean.shape
+    checked = []
+    for index, pair in enumerate(candidates):
+        if len(pair) != 2:
+            raise InputError(f"candidate {index}: expected a pair of images, one per half, got {len(pair)}")
+        with np.errstate(over="ignore"):
+            images = [np.ascontiguousarray(image, np.float32) for image in pair]
+        for name, image in zip("AB", images, strict=True):
+            if image.shape != expected:
+                raise InputError(
+                    f"candidate {index}, half {name}: expected shape {expected} as the colour has it, "
+                    f"got {image.shape}"
+                )
+            if not np.isfinite(image).all():
+                raise InputError(
+                    f"candidate {index}, half {name}: expected finite radiance, found NaN or Inf"
+                )
+        checked.append((images[0], images[1]))
+    return tuple(checked)
+
+
+def evidence_from_buffers(
+    buffers: RenderBuffers,
+    settings: FitSettings,
+    pilots: Sequence[Pilot],
+    candidates: Sequence[Halves],
+    started: float,
+    progress: Progress,
+    reference: int | None = None,
+) -> Evidence | FitResult:
+    """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
+
+    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``reference`` None: the
+    pilot that predicts the other half best. ``started`` is a value of time.perf_counter.
+
+    Where there are no independent halves to score pilots with, returns what one of them makes of the image.
+    """
+    notes = []
+    scale = _exposure(buffers.color.mean)
+    missing = [name for name in ("albedo", "normal", "depth") if getattr(buffers, name) is None]
+    if missing:
+        notes.append(f"no {', '.join(missing)}: edges are found with less evidence")
+    color = buffers.color
+    variance = None if color.variance is None else _scaled(_scaled(color.variance, scale), scale)
+    threads = settings.threads or 0
+    guidance = guidance_from_buffers(buffers, threads)
+    progress(0.05, "features")
+
+    test = halves_independent(buffers, settings.threads)
+    if color.half_a is None or color.half_b is None or not test.independent:
+        if _converged(color):
+            notes.append("the halves agree to within a few thousandths: the image is returned as it is")
+            image = color.mean.copy()
+        else:
+            notes.append(_why_no_halves(buffers, test))
+            if candidates:
+                notes.append("the candidates are not used: nothing can score them")
+            guides, irradiances, noise = first_pilots((_scaled(color.mean, scale),), variance, guidance)
+            (image,) = pilot_images(_ONLY_PILOT, irradiances, guides, noise, guidance)
+            image /= np.float32(scale)
+        seconds = time.perf_counter() - started
+        progress(1.0, "one pilot")
+        history = (HistoryPoint(seconds, 0, None),)
+        return FitResult(image, settings, seconds, iterations=0, history=history, notes=tuple(notes))
+
+    mean = _scaled(color.mean, scale)
+    halves, fireflies = limit_fireflies(_scaled(color.half_a, scale), _scaled(color.half_b, scale), threads)
+    if fireflies is not None:
+        notes.append(fireflies)
+        mean = np.float32(0.5) * (halves[0] + halves[1])
+    images: list[Halves] = [halves]
+    guides, irradiances, noise = first_pilots(halves, variance, guidance)
+    for index, pilot in enumerate(pilots):
+        progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
+        spent = time.perf_counter() - started
+        if index > 0 and spent > 0.7 * (settings.time_budget_s or math.inf):
+            break
+        image_a, image_b = pilot_images(pilot, irradiances, guides, noise, guidance)
+        images.append((image_a, image_b))
+    computed = tuple(pilots[: len(images) - 1])
+    for image_a, image_b in candidates:
+        images.append((np.maximum(_scaled(image_a, scale), 0), np.maximum(_scaled(image_b, scale), 0)))
+
+    denominators = _denominators(images[len(computed)])
+    errors = [_errors(pilot, halves, denominators) for pilot in images]
+    if reference is None:
+        mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
+        reference = 1 + int(np.argmin(mean_errors))
+    noise_a, noise_b = (
+        mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[reference]
+    )
+    return Evidence(
+        scale, mean, guidance, computed, tuple(images), reference, (noise_a, noise_b), tuple(notes)
+    )
+
+
+def loss_weights(evidence: Evidence) -> Halves:
+    """Return how much the squared error of each half's pixels counts, shape (height, width, 1).
+
+    Relative to what the half itself says, never to the half that scores it: a pixel must not count less
+    because the noise that it is compared with is bright, or the image would darken.
+    """
+    denominators = _denominators(evidence.pilots[len(evidence.computed)])
+    weight_a, weight_b = (
+        np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
+        for d, noise in zip(denominators, evidence.noises, strict=True)
+    )
+    return weight_a, weight_b
+
+
+def plane_names(evidence: Evidence) -> tuple[str, ...]:
+    """Return the names of the planes that `planes_of_half` yields, in its order."""
+    others = [index for index in range(len(evidence.pilots)) if index != evidence.reference]
+    return (
+        *evidence.guidance.names,
+        "noise",
+        "level",
+        *(
+            f"pilot {index} {what}"
+            for index in others
+            for what in ("brightness", *(f"score {radius}" for radius in _SCORE_RADII))
+        ),
+    )
+
+
+def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
+    """Yield what the network sees of one half, plane by plane, each of shape (height, width)."""
+    threads = evidence.guidance.threads
+    features = evidence.guidance.features
+    for channel in range(features.shape[2]):
+        yield features[:, :, channel]
+    noise = evidence.noises[half]
+    yield np.log(noise + np.float32(1e-4))[:, :, 0]
+    base = _log_level(evidence.pilots[evidence.reference][half])
+    yield base[:, :, 0]
+
+    other = evidence.halves[1 - half]
+    denominator = _denominators(evidence.pilots[len(evidence.computed)])[half]
+    cap = np.float32(_OUTLIER) * noise + np.float32(1e-3)
+    reference = np.minimum(_error(evidence.pilots[evidence.reference][half], other, denominator), cap)
+    for index, pilot in enumerate(evidence.pilots):
+        if index == evidence.reference:
+            continue
+        yield np.clip(_log_level(pilot[half]) - base, -2, 2)[:, :, 0]
+        worse = np.minimum(_error(pilot[half], other, denominator), cap) - reference
+        for radius in _SCORE_RADII:
+            score = mean_around(worse, radius, threads) / (np.float32(0.05) * noise + np.float32(1e-4))
+            yield np.clip(score, -3, 3)[:, :, 0]
+
+
+def network_inputs(evidence: Evidence) -> Array:
+    """Return the planes of both halves, shape (2, height * width, planes)."""
+    height, width = evidence.halves[0].shape[:2]
+    # Filled plane by plane: this is the largest array of a fit.
+    inputs = np.empty((2, height * width, len(plane_names(evidence))), np.float32)
+    for half in (0, 1):
+        for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
+            column[:] = plane.ravel()
+    return inputs
+
+
+@dataclass(frozen=True)
+class Standardisation:
+    """What brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
+
+    mean: npt.NDArray[np.float64]
+    std: Array
+
+    def apply(self, inputs: Array) -> None:
+        """Standardise planes in place, shape (halves, pixels, planes), clipped to 4 standard deviations."""
+        for column, (mean, std) in enumerate(zip(self.mean, self.std, strict=True)):
+            plane = inputs[:, :, column]
+            plane -= mean
+            plane /= std
+            np.clip(plane, -_LARGEST_INPUT, _LARGEST_INPUT, out=plane)
+
+
+def standardisation_of(inputs: Array) -> Standardisation:
+    """Return mean and standard deviation of every plane of shape (halves, pixels, planes)."""
+    planes = range(inputs.shape[2])
+    mean = np.array([inputs[:, :, plane].mean(dtype=np.float64) for plane in planes])
+    centred = np.empty(inputs.shape[:2], np.float32)
+    std = np.empty(len(planes), np.float32)
+    for plane in planes:
+        np.subtract(inputs[:, :, plane], mean[plane], out=centred)
+        std[plane] = max(float(centred.std(dtype=np.float64)), _LEAST_SPREAD)
+    return Standardisation(mean, std)
+
+
+def witnesses(evidence: Evidence) -> list[tuple[Array, Array]]:
+    """The noisy halves and, far less noisy but a little blurred, the smallest pilot; shape (pixels, 3)."""
+    return [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in evidence.pilots[:2]]
+
+
+def estimate_error(
+    fused_a: Array, fused_b: Array, witnesses: list[tuple[Array, Array]]
+) -> tuple[Array, Array, float]:
+    """Estimate the squared error of f = (fused_a + fused_b) / 2, relative to f^2 + epsilon.
+
+    Arrays have shape (pixels, 3). Returns, per pixel, the unbiased estimate and the part of it that is noise,
+    and their mean over all pixels. With independent witnesses a, b of truth x and outputs f_a, f_b made of
+    one half each, E (f_a - b)^2 is the error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E
+    (f_a - f_b)^2 / 2 the variance of one output; the mean of two has half of that. The first witnesses that
+    leave the mean a small standard error are believed.
+    """
+    denominator = ((fused_a + fused_b) / 2) ** 2 + np.float32(RELMSE_EPSILON)
+    noise = (((fused_a - fused_b) ** 2 / 4) / denominator).mean(axis=1)
+    for half_a, half_b in witnesses:
+        crossed = (fused_a - half_b) ** 2 + (fused_b - half_a) ** 2 - (half_a - half_b) ** 2
+        unbiased = (crossed / 2 / denominator).mean(axis=1) - noise
+        mean = float(unbiased.mean(dtype=np.float64))
+        if float(unbiased.std(dtype=np.float64)) < _SURE * mean * math.sqrt(unbiased.size):
+            break
+    return unbiased, noise, max(mean, float(noise.mean(dtype=np.float64)))
+
+
+def result_from_fused(
+    evidence: Evidence,
+    fused: Halves,
+    settings: FitSettings,
+    started: float,
+    iterations: int,
+    history: Sequence[HistoryPoint] = (),
+    notes: Sequence[str] = (),
+) -> FitResult:
+    """Make the result of what the network made of each half, or of the input if that is as good."""
+    threads = evidence.guidance.threads
+    shape = fused[0].shape
+    fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
+    unbiased, spread, estimate = estimate_error(fused_a, fused_b, witnesses(evidence))
+    # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and the
+    # halves' difference, which has little noise, is the least that it can be.
+    maps = [_core.box_mean(e.reshape(*shape[:2], 1), _ERROR_RADIUS, threads) for e in (unbiased, spread)]
+    image, error = np.float32(0.5) * (fused[0] + fused[1]), np.maximum(*maps)
+
+    # The error of the plain mean, by the same evidence.
+    half_a, half_b = evidence.halves
+    noise_of_input = (half_a - half_b) ** 2 / 4 / (image**2 + np.float32(RELMSE_EPSILON))
+    error_of_input = float(noise_of_input.mean(dtype=np.float64))
+    notes = [*evidence.notes, *notes]
+    if estimate >= error_of_input:
+        notes.append("the input is as good as anything fitted to it, and is returned as it is")
+        image, fused, estimate = evidence.mean, evidence.halves, error_of_input
+        error = _core.box_mean(noise_of_input.mean(axis=2, keepdims=True), _ERROR_RADIUS, threads)
+    unscale = np.float32(evidence.scale)
+    return FitResult(
+        color=image / unscale,
+        settings=settings,
+        seconds=time.perf_counter() - started,
+        iterations=iterations,
+        error=error,
+        estimated_relmse=estimate,
+        halves=(fused[0] / unscale, fused[1] / unscale),
+        history=tuple(history),
+        notes=tuple(notes),
+    )
+
+
+def _scaled(image: FloatImage, scale: float) -> FloatImage:
+    brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
+    scaled: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
+    return scaled
+
+
+def _denominators(smooth: Halves) -> Halves:
+    """What squared errors are relative to, per half, shape (height, width, 1)."""
+    a, b = (image.mean(axis=2, keepdims=True) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
+    return a, b
+
+
+def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
+    """How well each half's pilot predicts the other half."""
+    a, b = (_error(*images) for images in zip(pilot, halves[::-1], denominators, strict=True))
+    return a, b
+
+
+def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
+    error: FloatImage = ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
+    return error
+
+
+def _capped(error: FloatImage, threads: int) -> FloatImage:
+    limit = np.float32(_OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
+    capped: FloatImage = np.minimum(error, limit)
+    return capped
+
+
+def _log_level(image: FloatImage) -> FloatImage:
+    log_level: FloatImage = np.log(image.mean(axis=2, keepdims=True) + np.float32(_LOG_OFFSET))
+    return log_level
+
+
+def _converged(color: Buffer) -> bool:
+    """Whether halves differ (copies do not) by less than lets a test tell if their noise is independent."""
+    if color.half_a is None or color.half_b is None:
+        return False
+    squared = color.mean**2 + np.float32(RELMSE_EPSILON)
+    noise = float(np.mean((color.half_a - color.half_b) ** 2 / 4 / squared))
+    sampled = 0.0 if color.variance is None else float(np.mean(color.variance / squared))
+    return 0 < noise < _CONVERGED and sampled < _CONVERGED
+
+
+def _exposure(color: FloatImage) -> float:
+    """The power of two that brings the median of the lit pixels near the typical radiance (exact to undo)."""
+    level = color.mean(axis=2, dtype=np.float64)
+    lit = level[level > 0]
+    if lit.size == 0:
+        return 1.0
+    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
+
+
+def _why_no_halves(buffers: RenderBuffers, test: _core.HalvesTest) -> str:
+    tail = "nothing can score the result: one pilot is used, without an estimate of its error"
+    if not buffers.color.has_halves:
+        return f"no half buffers: {tail}"
+    return f"the half buffers are not independent (correlation {test.correlation:.2f}): {tail}"
