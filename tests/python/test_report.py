@@ -4,6 +4,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from browser import assert_page_works
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.report.page import report_page
@@ -34,6 +35,10 @@ class Page(HTMLParser):
         self.text += data
 
 
+def images_of(page):
+    return [attributes["alt"] for tag, attributes in page.elements if tag == "img"]
+
+
 @pytest.fixture
 def result(render):
     return FitResult(
@@ -57,10 +62,10 @@ def test_the_page_shows_everything_and_needs_no_network(render, result):
     html = report_page("A <b>room</b>", render.buffers, result, "filmic", ["mended 3 NaN"])
     page = Page(html)
     images = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
-    assert set(images) == {"noisy", "denoised", "estimated error"}
+    assert set(images) == {"noisy", "denoised", "albedo", "normal", "depth", "estimated error"}
     assert all(source.startswith("data:image/png;base64,iVBOR") for source in images.values())
     assert images["noisy"] != images["denoised"]
-    assert not re.search(r"https?://|@import|<script", html)
+    assert not re.search(r"https?://|@import|src=.(?!data:)|url\(", html)
     for words in (
         "A <b>room</b>",
         "12.3 s",
@@ -92,7 +97,7 @@ def test_what_is_not_known_is_said_and_not_drawn(render):
     fitted = FitResult(render.reference, FitSettings(), 1.0, 10, history=(HistoryPoint(1.0, 10, None),))
     page = Page(report_page("room", buffers, fitted, "gamma"))
     tags = [tag for tag, _ in page.elements]
-    assert tags.count("img") == 2
+    assert images_of(page) == ["noisy", "denoised"]
     assert "svg" not in tags
     assert "the error was not estimated" in page.text
     assert "the colour alone" in page.text
@@ -108,7 +113,7 @@ def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
     fitted = FitResult(color, FitSettings("paper"), 0.0, 2, error, 0.1, history)
     page = Page(report_page("small", small.buffers, fitted, "reinhard"))
     assert "all+random" in page.text
-    assert "nan" not in page.text
+    assert not re.search(r"\bnan\b", page.text)
 
 
 def test_side_by_side_keeps_both_pictures():
@@ -130,7 +135,20 @@ def test_false_colors_run_from_none_to_the_99th_percentile():
     assert np.all(np.diff(luminance) >= -1e-6)
 
 
+def test_maps_of_one_scale_have_one_brightest_error():
+    error = np.full((2, 3, 1), 0.25, np.float32)
+    picture, most = error_in_false_color(error, most=0.5)
+    assert most == 0.5
+    np.testing.assert_allclose(picture * 255, np.broadcast_to(FALSE_COLORS[-1], (2, 3, 3)), atol=0.01)
+
+
 def test_no_error_at_all_is_dark():
     picture, most = error_in_false_color(np.zeros((2, 3, 1), np.float32))
     assert most == 1
     np.testing.assert_allclose(picture * 255, np.broadcast_to(FALSE_COLORS[0], (2, 3, 3)), atol=0.01)
+
+
+def test_the_page_works_in_a_browser(render, result, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(report_page("A room with " + "a_long_name" * 9, render.buffers, result, "filmic"))
+    assert_page_works(path)

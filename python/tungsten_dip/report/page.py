@@ -1,23 +1,18 @@
-"""The report: one HTML page that needs no network, with the pictures, the error and what led to them."""
+"""The report of one fit: a page that needs no network, with the pictures, the error and what led to them."""
 
 from __future__ import annotations
 
-import base64
 import math
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from html import escape
-from importlib import resources
-from pathlib import Path
-from string import Template
 
 import numpy as np
 
-from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
-from tungsten_dip.report.preview import FALSE_COLORS, error_in_false_color
+from tungsten_dip.report import parts
+from tungsten_dip.report.parts import Picture
+from tungsten_dip.report.preview import error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
 
 CURVE_WIDTH, CURVE_HEIGHT = 720, 260
@@ -33,21 +28,46 @@ def report_page(
     ``remarks`` are lines on the input (what was taken for what, what was mended); the fit's notes follow,
     except for those that are among the remarks already.
     """
-    template = Template(resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    return template.substitute(
-        title=escape(title),
-        subtitle=escape(_subtitle(buffers)),
-        figures="".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in _figures(result)),
-        width=buffers.width,
-        height=buffers.height,
-        noisy=_data_uri(display_from_radiance(buffers.color.mean, tonemap)),
-        denoised=_data_uri(display_from_radiance(result.color, tonemap)),
-        error_map=_error_map(result),
-        false_colors=", ".join(f"rgb({r} {g} {b})" for r, g, b in FALSE_COLORS),
-        curve=_curve(result.history),
-        settings="".join(f"<tr><th>{name}</th><td>{value}</td></tr>" for name, value in _settings(result)),
-        notes=_bullets(list(dict.fromkeys([*remarks, *result.notes]))),
-    )
+    features = list(_features(buffers))
+    pictures = [
+        Picture("noisy", display_from_radiance(buffers.color.mean, tonemap)),
+        Picture("denoised", display_from_radiance(result.color, tonemap)),
+        *features,
+    ]
+    notes = list(dict.fromkeys([*remarks, *result.notes]))
+    body = [
+        parts.figures(_figures(result)),
+        parts.comparison(pictures, left=0, right=1),
+        *_error_map(result),
+        "<h2>Error over time</h2>",
+        _curve(result.history),
+        *(("<h2>Guided by</h2>", parts.gallery(features)) if features else ()),
+        "<h2>Settings</h2>",
+        parts.facts(_settings(result)),
+        "<h2>Notes</h2>",
+        parts.bullets(notes) if notes else "<p>Nothing was missing and nothing had to be mended.</p>",
+    ]
+    return parts.page(title, _subtitle(buffers), body)
+
+
+def _features(buffers: RenderBuffers) -> Iterator[Picture]:
+    """Yield the means of the features: normals as (n + 1) / 2, depth divided by its 99th percentile."""
+    for name, buffer in buffers.quantities():
+        values = np.nan_to_num(buffer.mean)
+        if name == "color":
+            continue
+        if name == "albedo":
+            values = display_from_radiance(values, "gamma")
+        elif name == "normal":
+            values = np.float32(0.5) * (values + 1)
+        elif name == "depth":
+            values = values / (np.percentile(values, 99) or 1)
+        yield Picture(name, _in_range(values))
+
+
+def _in_range(values: FloatImage) -> FloatImage:
+    rgb = np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3))
+    return np.ascontiguousarray(rgb, dtype=np.float32)
 
 
 def _subtitle(buffers: RenderBuffers) -> str:
@@ -64,37 +84,20 @@ def _figures(result: FitResult) -> Iterable[tuple[str, str]]:
         yield "estimated relMSE", f"{result.estimated_relmse:.3g}"
 
 
-def _settings(result: FitResult) -> Iterable[tuple[str, str]]:
+def _settings(result: FitResult) -> Iterator[tuple[str, str]]:
     for name, value in asdict(result.settings).items():
         if value is None or (name in PAPER_SETTINGS and result.settings.preset != "paper"):
             continue
-        yield (
-            name.replace("_", " "),
-            escape(", ".join(map(str, value)) if isinstance(value, tuple) else str(value)),
-        )
+        yield name.replace("_", " "), ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _bullets(lines: Sequence[str]) -> str:
-    if not lines:
-        return "<p>Nothing was missing and nothing had to be mended.</p>"
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
-
-
-def _error_map(result: FitResult) -> str:
+def _error_map(result: FitResult) -> Iterator[str]:
     if result.error is None:
-        return ""
+        return
     picture, most = error_in_false_color(result.error)
-    return (
-        f'<h2>Where the error is</h2><img alt="estimated error" src="{_data_uri(picture)}">'
-        f'<div class="scale">0%<i></i>{most:.0%} of the radiance and more</div>'
-    )
-
-
-def _data_uri(picture: FloatImage) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        write_image(path, picture)
-        return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+    yield "<h2>Where the error is</h2><p>The estimated relative error of every pixel.</p>"
+    yield f'<img alt="estimated error" src="{parts.data_uri(picture)}">'
+    yield parts.error_scale(most)
 
 
 def _curve(history: Sequence[HistoryPoint]) -> str:
@@ -113,26 +116,27 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
     def y(level: float) -> float:
         return CURVE_TOP + (top - level) / (top - bottom) * (CURVE_HEIGHT - CURVE_TOP - CURVE_BOTTOM)
 
-    parts = []
+    drawn = []
     right = CURVE_WIDTH - CURVE_RIGHT
     for exponent in range(bottom, top + 1):
         at, label = f"{y(exponent):.1f}", f"{10.0**exponent:g}"
-        parts.append(f'<line class="grid" x1="{CURVE_LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
-        parts.append(f'<text x="{CURVE_LEFT - 8}" y="{at}" dy="4" text-anchor="end">{label}</text>')
+        drawn.append(f'<line class="gridline" x1="{CURVE_LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
+        drawn.append(f'<text x="{CURVE_LEFT - 8}" y="{at}" dy="4" text-anchor="end">{label}</text>')
     step = _round_step(seconds[-1] / 6)
     for count in range(int(seconds[-1] / step) + 1):
         place = f'x="{x(count * step):.1f}" y="{CURVE_HEIGHT - CURVE_BOTTOM + 22}"'
-        parts.append(f'<text {place} text-anchor="middle">{count * step:g}</text>')
-    parts.append(f'<text x="{right}" y="{CURVE_HEIGHT - 6}" text-anchor="end">seconds</text>')
+        drawn.append(f'<text {place} text-anchor="middle">{count * step:g}</text>')
+    drawn.append(f'<text x="{right}" y="{CURVE_HEIGHT - 6}" text-anchor="end">seconds</text>')
     line = " ".join(f"{x(time):.1f},{y(level):.1f}" for time, level in zip(seconds, levels, strict=True))
-    parts.append(f'<polyline class="curve" points="{line}"/>')
+    drawn.append(f'<polyline class="curve" points="{line}"/>')
     for (point, relmse), level in zip(known, levels, strict=True):
         told = f"{point.seconds:.1f} s, iteration {point.iteration}: relMSE {relmse:.3g}"
         place = f'cx="{x(point.seconds):.1f}" cy="{y(level):.1f}" r="3"'
-        parts.append(f"<circle {place}><title>{told}</title></circle>")
+        drawn.append(f"<circle {place}><title>{told}</title></circle>")
     return (
-        f'<p>Estimated relMSE, logarithmic.</p><svg viewBox="0 0 {CURVE_WIDTH} {CURVE_HEIGHT}" role="img" '
-        f'aria-label="Estimated relMSE over seconds">{"".join(parts)}</svg>'
+        '<p>Estimated relMSE, logarithmic.</p><svg class="curve-plot" role="img" '
+        f'viewBox="0 0 {CURVE_WIDTH} {CURVE_HEIGHT}" aria-label="Estimated relMSE over seconds">'
+        f"{''.join(drawn)}</svg>"
     )
 
 

@@ -19,14 +19,14 @@ def side_by_side(left: FloatImage, right: FloatImage) -> FloatImage:
     return np.concatenate([left, bar, right], axis=1)
 
 
-def error_in_false_color(error: FloatImage) -> tuple[FloatImage, float]:
+def error_in_false_color(error: FloatImage, most: float | None = None) -> tuple[FloatImage, float]:
     """Return a picture of an error map, and the relative error that its brightest colour means.
 
     The map holds squared relative errors, shape (height, width, 1); the picture, shape (height, width, 3),
-    shows their roots from 0 to the 99th percentile.
+    shows their roots from 0 to ``most``, by default the 99th percentile.
     """
     relative = np.sqrt(np.maximum(np.nan_to_num(error[..., 0]), 0))
-    most = float(np.percentile(relative, 99)) or 1.0
+    most = most or float(np.percentile(relative, 99)) or 1.0
     stops = np.linspace(0, most, len(FALSE_COLORS))
     channels = [np.interp(relative, stops, levels) for levels in np.array(FALSE_COLORS).T / 255]
     return np.stack(channels, axis=-1).astype(np.float32), most
