@@ -11,6 +11,7 @@ from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import checked_candidates
+from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
 
@@ -30,6 +31,7 @@ def denoise(
     settings: FitSettings | None = None,
     progress: Progress = silent,
     candidates: Sequence[tuple[FloatImage, FloatImage]] = (),
+    warm_start: Model | None = None,
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 
@@ -44,10 +46,14 @@ def denoise(
     network chooses among them and its own. Without independent halves nothing can score them: they are not
     used.
 
-    Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is, or
-    candidates are of another shape or not finite.
+    With ``warm_start`` (of an earlier frame, say) the network starts from the model's weights, with its
+    pilots and constants, and trains for as many steps as the error that the halves tell asks for, at most
+    ``settings.iterations``. Without settings, those of the model hold.
+
+    Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is,
+    candidates are of another shape or not finite, or the model does not fit the image or the settings.
     """
-    settings = settings or FitSettings()
+    settings = settings or (FitSettings() if warm_start is None else warm_start.settings)
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     require_torch()
@@ -58,11 +64,11 @@ def denoise(
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
         from tungsten_dip.fit.paper import fit_paper
 
-        result = fit_paper(buffers, settings, progress)
+        result = fit_paper(buffers, settings, progress, warm_start)
     else:
         from tungsten_dip.fit.fusion import fit_fusion
 
-        result = fit_fusion(buffers, settings, progress, given)
+        result = fit_fusion(buffers, settings, progress, given, warm_start)
     result = replace(result, notes=(*mended, *result.notes))
     for note in result.notes:
         _LOG.info(note)

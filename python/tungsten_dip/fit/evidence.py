@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +47,7 @@ _CONVERGED = 1e-5
 
 _LOG_OFFSET = 0.02
 _SCORE_RADII = (2, 4, 8)
+PLANES_RADIUS = max(_SCORE_RADII)
 _NOISE_RADIUS = 8
 _OUTLIER = 20.0
 """A squared error this many times the local mean is an outlier: capped where it tells of a place's noise."""
@@ -55,29 +56,61 @@ _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
 _LEAST_SPREAD = 1e-6
-_LARGEST_INPUT = 4.0
+LARGEST_INPUT = 4.0
 _ERROR_RADIUS = 4
 _SURE = 0.35
 """Relative standard error of an estimated relMSE up to which it is believed."""
 
 
 @dataclass(frozen=True)
+class Layout:
+    """What a network sees and chooses among: the same for every image that it is used on.
+
+    ``features`` names channels of the features. The pilots are the noisy image, then what ``pilots``
+    describes, then ``candidates`` images that are handed in. ``reference`` is the index of the one that the
+    others are compared with.
+    """
+
+    features: tuple[str, ...]
+    pilots: tuple[Pilot, ...]
+    candidates: int
+    reference: int
+
+    @property
+    def choices(self) -> int:
+        """How many images the network chooses among."""
+        return 1 + len(self.pilots) + self.candidates
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """The names of what `planes_of_half` yields, in its order."""
+        return (
+            *self.features,
+            "noise",
+            "level",
+            *(
+                f"pilot {index} {what}"
+                for index in range(self.choices)
+                if index != self.reference
+                for what in ("brightness", *(f"score {radius}" for radius in _SCORE_RADII))
+            ),
+        )
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies.
-    ``pilots`` holds what each pilot makes of both halves: first the noisy halves themselves, then what
-    ``computed`` describes, then the candidates that were handed in. ``reference`` is the index of the pilot
-    that the others are compared with. ``noises`` is the relative squared difference, shape (height, width,
-    1), of that pilot and the half that it has not seen, in the pixels around each.
+    ``mean`` is the noisy image, without fireflies. ``pilots`` holds what each pilot makes of both halves, the
+    noisy halves themselves first. ``noises`` is the relative squared difference, shape (height, width, 1), of
+    the reference pilot and the half that it has not seen, in the pixels around each.
     """
 
     scale: float
     mean: FloatImage
     guidance: Guidance
-    computed: tuple[Pilot, ...]
+    layout: Layout
     pilots: tuple[Halves, ...]
-    reference: int
     noises: Halves
     notes: tuple[str, ...]
 
@@ -85,6 +118,30 @@ class Evidence:
     def halves(self) -> Halves:
         """The noisy halves."""
         return self.pilots[0]
+
+    @property
+    def smooth(self) -> Halves:
+        """The last of the computed pilots: what errors are relative to."""
+        return self.pilots[len(self.layout.pilots)]
+
+    def rows(self, first: int, end: int) -> Evidence:
+        """Return what is known of some rows alone."""
+
+        def cut(images: Halves) -> Halves:
+            return images[0][first:end], images[1][first:end]
+
+        guidance = replace(
+            self.guidance,
+            features=self.guidance.features[first:end],
+            albedo=self.guidance.albedo[first:end],
+        )
+        return replace(
+            self,
+            mean=self.mean[first:end],
+            guidance=guidance,
+            pilots=tuple(cut(pilot) for pilot in self.pilots),
+            noises=cut(self.noises),
+        )
 
 
 def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> tuple[Halves, ...]:
@@ -116,18 +173,20 @@ def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> 
 def evidence_from_buffers(
     buffers: RenderBuffers,
     settings: FitSettings,
-    pilots: Sequence[Pilot],
+    pilots: Sequence[Pilot] | Layout,
     candidates: Sequence[Halves],
     started: float,
     progress: Progress,
-    reference: int | None = None,
 ) -> Evidence | FitResult:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
-    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``reference`` None: the
-    pilot that predicts the other half best. ``started`` is a value of time.perf_counter.
+    ``pilots`` as a layout, of a network that exists, says all that it expects; all its pilots are computed.
+    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``started`` is a value
+    of time.perf_counter.
 
     Where there are no independent halves to score pilots with, returns what one of them makes of the image.
+
+    Raises InputError if a layout names a feature that is missing or another number of candidates.
     """
     notes = []
     scale = _exposure(buffers.color.mean)
@@ -139,6 +198,10 @@ def evidence_from_buffers(
     threads = settings.threads or 0
     guidance = guidance_from_buffers(buffers, threads)
     progress(0.05, "features")
+    layout = pilots if isinstance(pilots, Layout) else None
+    if layout is not None:
+        _check_fits(layout, guidance, candidates)
+    described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
     test = halves_independent(buffers, settings.threads)
     if color.half_a is None or color.half_b is None or not test.independent:
@@ -164,28 +227,27 @@ def evidence_from_buffers(
         mean = np.float32(0.5) * (halves[0] + halves[1])
     images: list[Halves] = [halves]
     guides, irradiances, noise = first_pilots(halves, variance, guidance)
-    for index, pilot in enumerate(pilots):
-        progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
-        spent = time.perf_counter() - started
-        if index > 0 and spent > 0.7 * (settings.time_budget_s or math.inf):
+    for index, pilot in enumerate(described):
+        progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
+        late = time.perf_counter() - started > 0.7 * (settings.time_budget_s or math.inf)
+        if layout is None and index > 0 and late:
             break
         image_a, image_b = pilot_images(pilot, irradiances, guides, noise, guidance)
         images.append((image_a, image_b))
-    computed = tuple(pilots[: len(images) - 1])
+    described = described[: len(images) - 1]
     for image_a, image_b in candidates:
         images.append((np.maximum(_scaled(image_a, scale), 0), np.maximum(_scaled(image_b, scale), 0)))
 
-    denominators = _denominators(images[len(computed)])
+    denominators = _denominators(images[len(described)])
     errors = [_errors(pilot, halves, denominators) for pilot in images]
-    if reference is None:
+    if layout is None:
         mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
-        reference = 1 + int(np.argmin(mean_errors))
+        best = 1 + int(np.argmin(mean_errors))
+        layout = Layout(guidance.names, described, len(candidates), reference=best)
     noise_a, noise_b = (
-        mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[reference]
+        mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[layout.reference]
     )
-    return Evidence(
-        scale, mean, guidance, computed, tuple(images), reference, (noise_a, noise_b), tuple(notes)
-    )
+    return Evidence(scale, mean, guidance, layout, tuple(images), (noise_a, noise_b), tuple(notes))
 
 
 def loss_weights(evidence: Evidence) -> Halves:
@@ -194,7 +256,7 @@ def loss_weights(evidence: Evidence) -> Halves:
     Relative to what the half itself says, never to the half that scores it: a pixel must not count less
     because the noise that it is compared with is bright, or the image would darken.
     """
-    denominators = _denominators(evidence.pilots[len(evidence.computed)])
+    denominators = _denominators(evidence.smooth)
     weight_a, weight_b = (
         np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
         for d, noise in zip(denominators, evidence.noises, strict=True)
@@ -202,38 +264,25 @@ def loss_weights(evidence: Evidence) -> Halves:
     return weight_a, weight_b
 
 
-def plane_names(evidence: Evidence) -> tuple[str, ...]:
-    """Return the names of the planes that `planes_of_half` yields, in its order."""
-    others = [index for index in range(len(evidence.pilots)) if index != evidence.reference]
-    return (
-        *evidence.guidance.names,
-        "noise",
-        "level",
-        *(
-            f"pilot {index} {what}"
-            for index in others
-            for what in ("brightness", *(f"score {radius}" for radius in _SCORE_RADII))
-        ),
-    )
-
-
 def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
-    """Yield what the network sees of one half, plane by plane, each of shape (height, width)."""
-    threads = evidence.guidance.threads
-    features = evidence.guidance.features
-    for channel in range(features.shape[2]):
-        yield features[:, :, channel]
+    """Yield what the network sees of one half, plane by plane, each of shape (height, width).
+
+    A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
+    """
+    threads, layout = evidence.guidance.threads, evidence.layout
+    for name in layout.features:
+        yield _feature(evidence.guidance, name)
     noise = evidence.noises[half]
     yield np.log(noise + np.float32(1e-4))[:, :, 0]
-    base = _log_level(evidence.pilots[evidence.reference][half])
+    base = _log_level(evidence.pilots[layout.reference][half])
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
-    denominator = _denominators(evidence.pilots[len(evidence.computed)])[half]
+    denominator = _denominators(evidence.smooth)[half]
     cap = np.float32(_OUTLIER) * noise + np.float32(1e-3)
-    reference = np.minimum(_error(evidence.pilots[evidence.reference][half], other, denominator), cap)
+    reference = np.minimum(_error(evidence.pilots[layout.reference][half], other, denominator), cap)
     for index, pilot in enumerate(evidence.pilots):
-        if index == evidence.reference:
+        if index == layout.reference:
             continue
         yield np.clip(_log_level(pilot[half]) - base, -2, 2)[:, :, 0]
         worse = np.minimum(_error(pilot[half], other, denominator), cap) - reference
@@ -246,7 +295,7 @@ def network_inputs(evidence: Evidence) -> Array:
     """Return the planes of both halves, shape (2, height * width, planes)."""
     height, width = evidence.halves[0].shape[:2]
     # Filled plane by plane: this is the largest array of a fit.
-    inputs = np.empty((2, height * width, len(plane_names(evidence))), np.float32)
+    inputs = np.empty((2, height * width, len(evidence.layout.planes)), np.float32)
     for half in (0, 1):
         for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
             column[:] = plane.ravel()
@@ -266,7 +315,7 @@ class Standardisation:
             plane = inputs[:, :, column]
             plane -= mean
             plane /= std
-            np.clip(plane, -_LARGEST_INPUT, _LARGEST_INPUT, out=plane)
+            np.clip(plane, -LARGEST_INPUT, LARGEST_INPUT, out=plane)
 
 
 def standardisation_of(inputs: Array) -> Standardisation:
@@ -348,6 +397,26 @@ def result_from_fused(
         history=tuple(history),
         notes=tuple(notes),
     )
+
+
+def _check_fits(layout: Layout, guidance: Guidance, candidates: Sequence[Halves]) -> None:
+    unknown = [n for n in layout.features if n not in guidance.names and n not in guidance.left_out]
+    if unknown:
+        raise InputError(
+            f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
+            f"fit without the model"
+        )
+    if layout.candidates != len(candidates):
+        raise InputError(
+            f"the model was fitted with {layout.candidates} candidates, this input comes with "
+            f"{len(candidates)}; give as many, or fit without the model"
+        )
+
+
+def _feature(guidance: Guidance, name: str) -> FloatImage:
+    if name in guidance.names:
+        return guidance.features[:, :, guidance.names.index(name)]
+    return np.full(guidance.features.shape[:2], guidance.left_out[name], np.float32)
 
 
 def _scaled(image: FloatImage, scale: float) -> FloatImage:

@@ -18,6 +18,8 @@ from tungsten_dip.fit.settings import FitSettings
 RANDOM_CHANNELS = 3
 """Channels of fixed random input, where there are any."""
 
+RANDOM_INPUT_SCALE = 0.1
+
 _QUANTITY_FROM_INPUTS = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
 _QUANTITIES = ("normal", "albedo", "depth")
 _PLANES = ("mean", "half_a", "half_b", "variance")
@@ -28,14 +30,28 @@ _GAMMA = 2.2
 class PaperImages:
     """``given`` is shown to the network beside ``random_channels``; its output is compared with ``wanted``.
 
-    Both are float32 in [0, 1], shape (height, width, channels). The first three channels of ``wanted`` are
-    the colour. ``notes`` says in one line each what was missing or left out.
+    Both are float32 in [0, 1], shape (height, width, channels). ``names`` are those of the channels of
+    ``given``. The first three channels of ``wanted`` are the colour. ``notes`` says in one line each what was
+    missing or left out.
     """
 
     given: FloatImage
+    names: tuple[str, ...]
     random_channels: int
     wanted: FloatImage
     notes: tuple[str, ...]
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """The names of the channels of `network_input`."""
+        return (*(f"random {index}" for index in range(self.random_channels)), *self.names)
+
+
+def network_input(images: PaperImages, seed: int) -> FloatImage:
+    """Return what the network sees: fixed random channels, then the given ones."""
+    shape = (*images.given.shape[:2], images.random_channels)
+    random = np.random.default_rng(seed).random(shape, np.float32) * np.float32(RANDOM_INPUT_SCALE)
+    return np.concatenate([random, images.given], axis=2)
 
 
 def ldr_from_radiance(radiance: FloatImage) -> FloatImage:
@@ -59,7 +75,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     would go in.
     """
     color = ldr_from_radiance(buffers.color.mean)
-    features = [color] if settings.scheme == "iic" and settings.inputs.startswith("all") else []
+    features = {"color": color} if settings.scheme == "iic" and settings.inputs.startswith("all") else {}
     random_channels = RANDOM_CHANNELS if settings.scheme == "ioc" or "random" in settings.inputs else 0
     notes = []
 
@@ -79,34 +95,36 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
         if missing:
             notes.append(f"{quantity}: no {', '.join(missing)}, used without")
         if buffer is not None:
-            features += _ldr_from_feature(quantity, buffer)
+            features |= _ldr_from_feature(quantity, buffer)
 
-    stack = np.concatenate([color[:, :, :0], *features], axis=2)
+    stack = np.concatenate([color[:, :, :0], *features.values()], axis=2)
+    names = [f"{name} {channel}" for name in features for channel in range(3)]
     if np.isnan(stack).any() or np.isnan(color).any():
         raise InputError("expected buffers without NaN, found NaN; sanitise them first")
     varies = stack.min(axis=(0, 1)) < stack.max(axis=(0, 1))
     if not varies.all():
         notes.append(f"{np.count_nonzero(~varies)} of {varies.size} feature channels are constant: left out")
     stack = np.ascontiguousarray(stack[:, :, varies])
+    names = [name for name, kept in zip(names, varies, strict=True) if kept]
 
     if settings.scheme == "ioc":
         wanted = np.concatenate([color, stack], axis=2)
-        return PaperImages(stack[:, :, :0], random_channels, wanted, tuple(notes))
+        return PaperImages(stack[:, :, :0], (), random_channels, wanted, tuple(notes))
     if stack.shape[2] + random_channels == 0:
         raise InputError(
             f"inputs {settings.inputs}: expected a channel that varies over the image, all are constant; "
             f"use inputs random"
         )
-    return PaperImages(stack, random_channels, color, tuple(notes))
+    return PaperImages(stack, tuple(names), random_channels, color, tuple(notes))
 
 
-def _ldr_from_feature(quantity: str, buffer: Buffer) -> list[FloatImage]:
+def _ldr_from_feature(quantity: str, buffer: Buffer) -> dict[str, FloatImage]:
     """Every known plane of a feature as three channels in [0, 1]."""
-    images = []
+    images = {}
     for plane, values in buffer.planes():
         if plane != "variance" and quantity == "normal":
             values = np.float32(0.5) * (values + 1)
         elif plane != "variance" and quantity == "depth":
             values = values / max(values.max(initial=0, where=np.isfinite(values)), np.finfo(np.float32).tiny)
-        images.append(np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3)))
+        images[f"{quantity} {plane}"] = np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3))
     return images

@@ -24,7 +24,8 @@ from torch import Tensor, nn
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.device import compute_device
-from tungsten_dip.fit.inputs import PaperImages, paper_images, radiance_from_ldr
+from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
+from tungsten_dip.fit.model import Model, Weights, check_planes, check_settings, source_sha256
 from tungsten_dip.fit.networks import ResNet, Skip
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
@@ -34,7 +35,6 @@ ITERATIONS = 3000
 LEARNING_RATE = 1e-3
 LOW_LOSS = 5e-4
 LOW_LOSS_LEARNING_RATE = 1e-4
-RANDOM_INPUT_SCALE = 0.1
 INPUT_NOISE_STD = 1 / 30
 AVERAGE_WEIGHT = 0.99
 BACKTRACK_DB = 5.0
@@ -51,16 +51,20 @@ class PaperFit:
     colour in dB, both of the latest iteration's output.
     """
 
-    def __init__(self, images: PaperImages, settings: FitSettings, device: torch.device) -> None:
+    def __init__(
+        self,
+        images: PaperImages,
+        settings: FitSettings,
+        device: torch.device,
+        warm_start: Model | None = None,
+    ) -> None:
         self.loss = math.inf
         self.psnr = -math.inf
         self._last_good_psnr = -math.inf
         generator = torch.Generator().manual_seed(settings.seed)
 
-        height, width, given_channels = images.given.shape
-        channels = images.random_channels + given_channels
-        random = torch.rand(height, width, images.random_channels, generator=generator) * RANDOM_INPUT_SCALE
-        fixed = torch.cat((random, torch.from_numpy(images.given)), 2)
+        fixed = torch.from_numpy(network_input(images, settings.seed))
+        channels = fixed.shape[2]
         self._input = _nchw(fixed.to(device))
         self._noisy_input = torch.empty_like(self._input)
         # Drawing every value anew would cost more than the network's first layer. The noise of an iteration
@@ -80,6 +84,9 @@ class PaperFit:
                 if settings.network == "skip"
                 else ResNet(channels, outputs)
             )
+        if warm_start is not None:
+            state = {name: torch.from_numpy(weight) for name, weight in warm_start.weights.items()}
+            self.network.load_state_dict(state)
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._weights: list[Tensor] = list(self.network.parameters())
         self._good_weights = [weight.detach().clone() for weight in self._weights]
@@ -115,6 +122,11 @@ class PaperFit:
         self._optimizer.param_groups[0]["lr"] = learning_rate(self.loss)
         self._optimizer.step()
 
+    def weights(self) -> Weights:
+        """Return a copy of the network's weights by name."""
+        state = self.network.state_dict()
+        return {name: weight.contiguous().cpu().numpy().copy() for name, weight in state.items()}
+
     def color(self) -> FloatImage:
         """Return the average so far as linear radiance, shape (height, width, 3)."""
         if self._average is None:
@@ -128,26 +140,34 @@ def learning_rate(loss: float) -> float:
     return LOW_LOSS_LEARNING_RATE if loss <= LOW_LOSS else LEARNING_RATE
 
 
-def fit_paper(buffers: RenderBuffers, settings: FitSettings, progress: Progress = silent) -> FitResult:
-    """Denoise by the published method.
+def fit_paper(
+    buffers: RenderBuffers,
+    settings: FitSettings,
+    progress: Progress = silent,
+    warm_start: Model | None = None,
+) -> FitResult:
+    """Denoise by the published method, starting from the weights of a model if there is one.
 
     Ends after ``settings.iterations`` or ``settings.time_budget_s``, whichever comes first, but not before
     the first iteration. An interrupt (KeyboardInterrupt) after it ends the fit with the average so far. On a
     CPU, the same seed and number of threads give the same bits.
 
-    Raises InputError if the image is empty or holds NaN, a feature named by the inputs is missing or the
-    device is not there.
+    Raises InputError if the image is empty or holds NaN, a feature named by the inputs is missing, the
+    device is not there, or the model does not fit the image or the settings.
     """
     start = time.perf_counter()
     if buffers.color.mean.size == 0:
         raise InputError(f"expected at least one pixel, got {buffers.width}x{buffers.height}; render more")
     images = paper_images(buffers, settings)
+    if warm_start is not None:
+        check_settings(warm_start, settings)
+        check_planes(warm_start, images.planes)
     total = settings.iterations or ITERATIONS
     notes = [*_notes_on_method(buffers, settings), *images.notes]
     history = []
     iteration = 0
     with compute_device(settings) as device:
-        fit = PaperFit(images, settings, device)
+        fit = PaperFit(images, settings, device, warm_start)
         try:
             while iteration < total:
                 fit.step()
@@ -170,9 +190,11 @@ def fit_paper(buffers: RenderBuffers, settings: FitSettings, progress: Progress 
         else:
             if iteration < total:
                 notes.append(f"the time budget ended at iteration {iteration} of {total}")
-        color = fit.color()
+        color, weights = fit.color(), fit.weights()
+    model = Model(settings.network, images.planes, weights, settings, None, source_sha256(buffers))
+    seconds = time.perf_counter() - start
     return FitResult(
-        color, settings, time.perf_counter() - start, iteration, history=tuple(history), notes=tuple(notes)
+        color, settings, seconds, iteration, model=model, history=tuple(history), notes=tuple(notes)
     )
 
 

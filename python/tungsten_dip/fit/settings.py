@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
+
+if TYPE_CHECKING:
+    from tungsten_dip.fit.model import Model
 
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
@@ -67,7 +70,8 @@ class FitResult:
     pixel, shape (height, width, 1), smoothed and never below what is noise in it, so that its mean is the
     larger. ``halves`` is what was made of half A of the samples alone and of half B alone, in the units and
     shape of ``color``, which is their mean (but for fireflies). These are None where the buffers hold no
-    independent evidence. ``notes`` says in one line each what evidence was missing and what that meant.
+    independent evidence. ``model`` is the fitted network, None where there was none to fit. ``notes`` says in
+    one line each what evidence was missing and what that meant.
     """
 
     color: FloatImage
@@ -77,5 +81,6 @@ class FitResult:
     error: FloatImage | None = None
     estimated_relmse: float | None = None
     halves: tuple[FloatImage, FloatImage] | None = None
+    model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()
     notes: tuple[str, ...] = field(default=())

@@ -1,0 +1,82 @@
+"""What a fit leaves behind beside the image: a network that later frames start from, or use as it is."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.evidence import Layout, Standardisation
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings
+
+Kind = Literal["pointwise", "skip", "resnet"]
+
+Weights = dict[str, npt.NDArray[np.float32]]
+"""By name. Those of convolutions have shape (outputs, inputs, height, width)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A fitted network and all that it takes to use it on another image.
+
+    ``kind`` pointwise is the network of the presets draft, balanced and final: it chooses pixel by pixel
+    among the pilots of ``layout``, and its inputs are standardised with constants of the image that it was
+    fitted to. The others are the networks of the preset paper, which give the image themselves; for them
+    ``layout`` and ``standardisation`` are None.
+
+    ``planes`` names the network's inputs in order. ``estimated_relmse`` is the error of the fit's result.
+    ``source_sha256`` is the SHA-256 of the colour that the network was fitted to (float32, row by row),
+    ``version`` that of this package.
+    """
+
+    kind: Kind
+    planes: tuple[str, ...]
+    weights: Weights
+    settings: FitSettings
+    estimated_relmse: float | None
+    source_sha256: str
+    layout: Layout | None = None
+    standardisation: Standardisation | None = None
+    version: str = metadata.version("tungsten-dip")
+
+
+def source_sha256(buffers: RenderBuffers) -> str:
+    """Return what tells one noisy image from another."""
+    return hashlib.sha256(np.ascontiguousarray(buffers.color.mean).data).hexdigest()
+
+
+def check_settings(model: Model, settings: FitSettings) -> None:
+    """Raise InputError that names the difference if the settings ask for another network than the model's."""
+    names = ("preset", *(PAPER_SETTINGS if settings.preset == "paper" else ()))
+    for name in names:
+        expected, asked = getattr(model.settings, name), getattr(settings, name)
+        if asked != expected:
+            raise InputError(
+                f"the model was fitted with {name} {_text(expected)}, this fit asks for {_text(asked)}; "
+                f"ask for {_text(expected)}, or fit without the model"
+            )
+
+
+def check_planes(model: Model, planes: tuple[str, ...]) -> None:
+    """Raise InputError that names the difference if an image's planes are not those that the model sees."""
+    if planes == model.planes:
+        return
+    missing = [name for name in model.planes if name not in planes]
+    unknown = [name for name in planes if name not in model.planes]
+    differences = [
+        f"{what} {', '.join(names)}" for what, names in (("lacks", missing), ("adds", unknown)) if names
+    ]
+    raise InputError(
+        f"the input does not fit the model: it {' and '.join(differences) or 'orders the planes otherwise'}; "
+        f"render the same buffers, or fit without the model"
+    )
+
+
+def _text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,0 +1,188 @@
+"""How the network that chooses among pilots is trained, whatever computes its steps: torch or onnxruntime."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.fit.evidence import (
+    Array,
+    Evidence,
+    Layout,
+    Standardisation,
+    estimate_error,
+    loss_weights,
+    network_inputs,
+    witnesses,
+)
+from tungsten_dip.fit.model import Weights
+from tungsten_dip.fit.settings import FitSettings, HistoryPoint
+from tungsten_dip.progress import Progress
+
+Indices = npt.NDArray[np.int64]
+
+HIDDEN = 16
+LEAKY_SLOPE = 0.2
+LEARNING_RATE = 1e-2
+ADAM_BETAS = (0.9, 0.999)
+ADAM_EPSILON = 1e-8
+_HEAD_START = 1.0
+"""Logit that the best single pilot starts with."""
+
+BATCH_PIXELS = 1 << 14
+_WARM_UP_STEPS = 10
+_HISTORY_EVERY = 20
+_PROBE_PIXELS = 1 << 15
+"""Pixels that are not trained on: the error is estimated there."""
+
+_PROBE_SHARE = 8
+"""One pixel in this many at most is set aside."""
+
+_WARM_RATE = 0.3
+"""A network that starts near its goal takes steps this many times as long."""
+
+_WARM_HISTORY_EVERY = 5
+_WARM_PATIENCE = 3
+_WARM_GAIN = 0.01
+"""It is done once this many estimates in a row have not lowered the error by this part."""
+
+
+class Network(Protocol):
+    """The network with its examples (`Examples`) and the state of its optimiser (Adam)."""
+
+    def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
+        """Train on some pixels: the mean of their weighted squared errors falls."""
+
+    def fuse(self, half: int, pixel: Indices | slice) -> Array:
+        """Return the weighted mean of the pilots, shape (pixels, 3)."""
+
+    def weights(self) -> Weights:
+        """Return a copy of the weights."""
+
+    def load(self, weights: Weights) -> None:
+        """Replace the weights."""
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What a network is trained on, flattened; the first axis tells the halves apart.
+
+    ``inputs`` has shape (2, pixels, planes), ``choices`` (2, pixels, pilots, 3), ``wanted``, the other half's
+    colour, (2, pixels, 3), and ``weight``, of the squared error, (2, pixels, 1).
+    """
+
+    inputs: Array
+    choices: Array
+    wanted: Array
+    weight: Array
+
+
+def examples_from_evidence(
+    evidence: Evidence, standardised: Callable[[Array], Standardisation]
+) -> tuple[Examples, Standardisation]:
+    """Return the examples, with inputs standardised by what ``standardised`` gives for them, and that."""
+    inputs = network_inputs(evidence)
+    standardisation = standardised(inputs)
+    standardisation.apply(inputs)
+    pixels = inputs.shape[1]
+    choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
+    for index, pilot in enumerate(evidence.pilots):
+        for half in (0, 1):
+            choices[half, :, index] = pilot[half].reshape(pixels, 3)
+    wanted = np.stack([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
+    weight = np.stack([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
+    return Examples(inputs, choices, wanted, weight), standardisation
+
+
+def first_weights(layout: Layout, seed: int) -> Weights:
+    """Return the weights that an untrained network starts from (He et al. 2015, uniform)."""
+    rng = np.random.default_rng(seed)
+    sizes = (len(layout.planes), HIDDEN, HIDDEN, layout.choices)
+    weights: Weights = {}
+    for layer, (inputs, outputs) in enumerate(pairwise(sizes), start=1):
+        bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs))
+        shape = (outputs, inputs, 1, 1)
+        weights[f"layer{layer}.weight"] = rng.uniform(-bound, bound, shape).astype(np.float32)
+        weights[f"layer{layer}.bias"] = np.zeros(outputs, np.float32)
+    # Starts from the mean of the pilots that the head start gives, whatever the seed.
+    weights["layer3.weight"][:] = 0
+    weights["layer3.bias"][layout.reference] = _HEAD_START
+    return weights
+
+
+@dataclass
+class Training:
+    """How far a training went."""
+
+    steps_done: int = 0
+    history: list[HistoryPoint] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def train(
+    network: Network,
+    examples: Examples,
+    evidence: Evidence,
+    settings: FitSettings,
+    steps: int,
+    started: float,
+    progress: Progress,
+    warm: bool,
+) -> Training:
+    """Train for ``steps`` steps, or fewer: within the time budget, to the target error, until Ctrl-C.
+
+    With ``warm``, the network knows another image already, and is done once the error of pixels that are not
+    trained on, as the halves tell it, falls no further.
+    """
+    rng = np.random.default_rng(settings.seed)
+    pixels = examples.inputs.shape[1]
+    order = rng.permutation(pixels)
+    held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
+    probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
+    told = [(a[probe], b[probe]) for a, b in witnesses(evidence)]
+    done = Training()
+
+    def estimate(step: int) -> float:
+        fused_a, fused_b = (network.fuse(half, probe) for half in (0, 1))
+        error = estimate_error(fused_a, fused_b, told)[2]
+        done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
+        return error
+
+    every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
+    best, best_weights, since_best = (estimate(0), network.weights(), 0) if warm else (math.inf, {}, 0)
+    try:
+        for step in range(1, steps + 1):
+            rate = min(1.0, step / _WARM_UP_STEPS)
+            rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * (step - 1) / steps)
+            batch = rng.integers(2 * len(trained), size=min(BATCH_PIXELS, 2 * len(trained)))
+            network.step(batch // len(trained), trained[batch % len(trained)], LEARNING_RATE * rate)
+            done.steps_done = step
+            if step % every != 0 and step != steps and step != 1:
+                continue
+            error = estimate(step)
+            progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
+            if warm:
+                since_best = 0 if error < (1 - _WARM_GAIN) * best else since_best + 1
+                if error < best:
+                    best, best_weights = error, network.weights()
+            if error <= (settings.target_error or -math.inf):
+                done.notes.append(f"stopped at step {step}: the target error is reached")
+                break
+            if time.perf_counter() - started > (settings.time_budget_s or math.inf):
+                done.notes.append(f"stopped at step {step}: the time budget is spent")
+                break
+            if since_best >= _WARM_PATIENCE:
+                done.notes.append(f"stopped at step {step}: the error falls no further")
+                break
+    except KeyboardInterrupt:
+        done.notes.append(f"interrupted at step {done.steps_done}: the image is what was reached by then")
+    if warm:
+        network.load(best_weights)
+    return done
