@@ -29,6 +29,8 @@ EXTRA_BY_MODULE = {
     "drjit": "mitsuba",
     "flip_evaluator": "compare",
     "skimage": "compare",
+    "pyoidn": "oidn",
+    "matplotlib": "bench",
 }
 """Which optional part of the package brings a module that is not installed."""
 

@@ -1,0 +1,259 @@
+"""What is compared: our presets and time budgets, the published method, other denoisers, more samples."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from tungsten_dip.bench.nfor import nfor_image
+from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
+from tungsten_dip.bench.sets import BenchSet
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.oidn import Quality, oidn_image, require_oidn
+from tungsten_dip.fit.settings import FitSettings, Preset
+from tungsten_dip.progress import Progress
+
+_LOG = logging.getLogger(__name__)
+
+KINDS = ("presets", "budgets", "paper", "oidn", "nfor", "samples")
+"""What `Plan.kinds` chooses from."""
+
+OURS, IN_TIME, PAPER, OIDN, NFOR, SAMPLES = SERIES = (
+    "our presets",
+    "ours, in a given time",
+    "published method",
+    "Open Image Denoise",
+    "NFOR",
+    "more samples",
+)
+NOISY = "noisy"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An image, and the seconds and iterations that it took where they are known."""
+
+    label: str
+    image: np.ndarray
+    seconds: float | None
+    iterations: int | None = None
+    loss: float | None = None
+    psnr_noisy: float | None = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to a denoised image; a run of it gives one outcome for each of its labels.
+
+    ``marks`` are the labels in the shortest words, for plots that name the series already. ``settings`` tells
+    two runs of one label apart. ``run`` takes the number of the repeat. A method that is not ``timed`` is run
+    once. ``pictured`` are the labels that a page shows the images of.
+    """
+
+    series: str
+    labels: tuple[str, ...]
+    marks: tuple[str, ...]
+    settings: str
+    run: Callable[[int, Progress], list[Outcome]]
+    timed: bool = True
+    pictured: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure.
+
+    ``presets`` and ``budgets_s`` are ours; a budget is one for ``final``. ``nfor_s`` is what the saved NFOR
+    image took, ``denoiser`` Tungsten's command to measure it with. ``scenes`` are those of the sets in their
+    order, if any; they are rendered with ``sample_factors`` times the samples.
+    """
+
+    kinds: tuple[str, ...] = KINDS
+    presets: tuple[Preset, ...] = ("draft", "balanced", "final")
+    budgets_s: tuple[float, ...] = (2, 5, 10, 20)
+    paper_iterations: int = 3000
+    nfor_s: float | None = None
+    denoiser: Path | None = None
+    scenes: tuple[Path, ...] = ()
+    sample_factors: tuple[int, ...] = (2, 4, 16)
+    repeats: int = 3
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown:
+            raise InputError(f"methods: expected some of {', '.join(KINDS)}, got {unknown[0]}")
+        for name in ("repeats", "paper_iterations", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name}: expected a number above 0, got {value}")
+
+
+def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]:
+    """Return the methods of every set by its name. What a machine or a set lacks is left out and logged.
+
+    Raises InputError if the plan names something that cannot be used.
+    """
+    if plan.scenes and len(plan.scenes) != len(sets):
+        raise InputError(f"expected a scene for each of {len(sets)} sets, got {len(plan.scenes)}")
+    if plan.denoiser is not None and not plan.denoiser.is_file():
+        raise InputError(f"{plan.denoiser}: no such file; name Tungsten's command denoiser")
+    has_oidn = "oidn" in plan.kinds and _has_oidn()
+    methods = {}
+    for index, bench_set in enumerate(sets):
+        scene = plan.scenes[index] if plan.scenes else None
+        methods[bench_set.name] = list(_methods(bench_set, plan, scene, has_oidn))
+    return methods
+
+
+def settings_text(settings: FitSettings) -> str:
+    """Return the settings that are not the default, ``preset=draft threads=2``."""
+    default = FitSettings()
+    values = ((field.name, getattr(settings, field.name)) for field in fields(settings))
+    return " ".join(
+        f"{name}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
+        for name, value in values
+        if value != getattr(default, name)
+    )
+
+
+def _has_oidn() -> bool:
+    try:
+        require_oidn()
+    except InputError as error:
+        _LOG.warning("%s; measured without", error)
+        return False
+    return True
+
+
+def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool) -> Iterator[Method]:
+    noisy = Outcome(NOISY, bench_set.buffers.color.mean, None)
+    yield Method(
+        NOISY, (NOISY,), (NOISY,), "", lambda repeat, progress: [noisy], timed=False, pictured=(NOISY,)
+    )
+    if "presets" in plan.kinds:
+        for preset in plan.presets:
+            settings = FitSettings(preset, threads=plan.threads)
+            yield _ours(bench_set, OURS, preset, preset, settings, pictured=True)
+            if preset == "final" and has_oidn and "pilot" in (field.name for field in fields(settings)):
+                guided = FitSettings(**{**asdict(settings), "pilot": "oidn"})
+                yield _ours(bench_set, OURS, "final, guided by OIDN", "guided", guided, pictured=True)
+    if "budgets" in plan.kinds:
+        for budget_s in plan.budgets_s:
+            settings = FitSettings("final", time_budget_s=budget_s, threads=plan.threads)
+            mark = f"{budget_s:g} s"
+            yield _ours(bench_set, IN_TIME, f"final in {mark}", mark, settings, pictured=False)
+    if "paper" in plan.kinds:
+        yield _paper(bench_set, FitSettings("paper", threads=plan.threads), plan.paper_iterations)
+    if has_oidn:
+        for quality in get_args(Quality):
+            yield _oidn(bench_set, quality, plan.threads)
+    if "nfor" in plan.kinds:
+        yield from _nfor(bench_set, plan)
+    if "samples" in plan.kinds and scene is not None:
+        yield from _samples(bench_set, plan, scene)
+
+
+def _ours(
+    bench_set: BenchSet, series: str, label: str, mark: str, settings: FitSettings, pictured: bool
+) -> Method:
+    def run(repeat: int, progress: Progress) -> list[Outcome]:
+        from tungsten_dip.fit import denoise
+
+        start = time.perf_counter()
+        result = denoise(bench_set.buffers, settings, progress)
+        return [Outcome(label, result.color, time.perf_counter() - start, result.iterations)]
+
+    shown = (label,) if pictured else ()
+    return Method(series, (label,), (mark,), settings_text(settings), run, pictured=shown)
+
+
+def _paper(bench_set: BenchSet, settings: FitSettings, iterations: int) -> Method:
+    counts = checkpoints_up_to(iterations)
+    label_of = {count: f"paper, {count} iterations" for count in counts}
+
+    def run(repeat: int, progress: Progress) -> list[Outcome]:
+        points = paper_curve(bench_set.buffers, settings, counts, progress)
+        return [
+            Outcome(label_of[p.iteration], p.color, p.seconds, p.iteration, p.loss, p.psnr_noisy)
+            for p in points
+        ]
+
+    labels = tuple(label_of.values())
+    marks = tuple(map(str, counts))
+    return Method(PAPER, labels, marks, settings_text(settings), run, pictured=labels[-1:])
+
+
+def _oidn(bench_set: BenchSet, quality: Quality, threads: int | None) -> Method:
+    label = f"OIDN {quality}"
+    buffers = bench_set.buffers
+
+    def run(repeat: int, progress: Progress) -> list[Outcome]:
+        albedo = buffers.albedo.mean if buffers.albedo else None
+        normal = buffers.normal.mean if buffers.normal else None
+        start = time.perf_counter()
+        image = oidn_image(buffers.color.mean, albedo, normal, quality=quality, threads=threads)
+        return [Outcome(label, image, time.perf_counter() - start)]
+
+    shown = (label,) if quality == "high" else ()
+    return Method(OIDN, (label,), (quality,), f"quality={quality}", run, pictured=shown)
+
+
+def _nfor(bench_set: BenchSet, plan: Plan) -> Iterator[Method]:
+    label, denoiser = "NFOR", plan.denoiser
+    if denoiser is not None:
+
+        def run(repeat: int, progress: Progress) -> list[Outcome]:
+            start = time.perf_counter()
+            image = nfor_image(bench_set.buffers, denoiser)
+            return [Outcome(label, image, time.perf_counter() - start)]
+
+        yield Method(NFOR, (label,), ("",), "measured", run, pictured=(label,))
+    elif bench_set.nfor is not None:
+        saved = Outcome(label, bench_set.nfor, plan.nfor_s)
+        told = f"saved, {plan.nfor_s:g} s" if plan.nfor_s else "saved"
+        unmeasured = Method(NFOR, (label,), ("",), told, lambda repeat, progress: [saved], timed=False)
+        yield replace(unmeasured, pictured=(label,))
+    else:
+        _LOG.info(
+            "%s: no nfor.exr beside the buffers and no denoiser named: NFOR is left out", bench_set.name
+        )
+
+
+def _samples(bench_set: BenchSet, plan: Plan, scene_path: Path) -> Iterator[Method]:
+    from tungsten_dip.hosts import render
+    from tungsten_dip.scene.parse import load_scene
+
+    scene = load_scene(scene_path)
+    size = (bench_set.buffers.width, bench_set.buffers.height)
+    if tuple(scene.camera.resolution) != size:
+        raise InputError(
+            f"{scene_path}: expected the resolution of {bench_set.name}, {size[0]} x {size[1]}, got "
+            f"{scene.camera.resolution[0]} x {scene.camera.resolution[1]}"
+        )
+    known = bench_set.buffers.spp
+    spp = scene.renderer.spp if known is None else round(float(np.mean(known)))
+
+    def method(factor: int) -> Method:
+        label = f"{factor} times the samples"
+
+        def run(repeat: int, progress: Progress) -> list[Outcome]:
+            start = time.perf_counter()
+            # Another seed than a first render has, so that it repeats none of its samples.
+            rendered = render(
+                scene, spp=factor * spp, seed=1000 + repeat, threads=plan.threads, progress=progress
+            )
+            # A denoiser comes after the noisy render, so what counts here is the time on top of that.
+            seconds = (time.perf_counter() - start) * (1 - 1 / factor)
+            return [Outcome(label, rendered.color.mean, seconds)]
+
+        return Method(SAMPLES, (label,), (f"{factor}x",), f"spp={factor * spp}", run)
+
+    for factor in plan.sample_factors:
+        yield method(factor)

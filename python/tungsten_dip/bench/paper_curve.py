@@ -1,0 +1,66 @@
+"""The published method as it goes: one fit, looked at after several iterations."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from tungsten_dip.buffers import FloatImage, RenderBuffers, sanitize
+from tungsten_dip.fit.device import compute_device
+from tungsten_dip.fit.inputs import paper_images
+from tungsten_dip.fit.paper import PaperFit
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.progress import Progress
+
+
+@dataclass(frozen=True)
+class PaperPoint:
+    """Where the fit stood after an iteration.
+
+    ``seconds`` are those of the fit alone, without this looking. ``loss`` and ``psnr_noisy`` (dB, of the
+    displayed images) are of the iteration's own output, as published; ``color`` is the running average that
+    the method gives as its result, linear radiance of shape (height, width, 3).
+    """
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr_noisy: float
+    color: FloatImage
+
+
+def paper_curve(
+    buffers: RenderBuffers, settings: FitSettings, checkpoints: Collection[int], progress: Progress
+) -> list[PaperPoint]:
+    """Fit up to the largest of the checkpoints, and return what was reached at each.
+
+    Raises InputError as `fit.paper.fit_paper` does.
+    """
+    start = time.perf_counter()
+    looking_s = 0.0
+    points = []
+    total = max(checkpoints)
+    buffers, _ = sanitize(buffers, settings.threads)
+    with compute_device(settings) as device:
+        fit = PaperFit(paper_images(buffers, settings), settings, device)
+        for iteration in range(1, total + 1):
+            fit.step()
+            progress(iteration / total, f"iteration {iteration}, PSNR to noisy {fit.psnr:.2f} dB")
+            if iteration in checkpoints:
+                looked = time.perf_counter()
+                color = fit.color()
+                seconds = looked - start - looking_s
+                points.append(PaperPoint(iteration, seconds, fit.loss, fit.psnr, color))
+                looking_s += time.perf_counter() - looked
+    return points
+
+
+def checkpoints_up_to(iterations: int, first: int = 100) -> tuple[int, ...]:
+    """Return 1 and 3 times the powers of ten from ``first`` on, and ``iterations``.
+
+    >>> checkpoints_up_to(3000)
+    (100, 300, 1000, 3000)
+    """
+    rounded = (digit * 10**exponent for exponent in range(len(str(iterations))) for digit in (1, 3))
+    return (*(count for count in rounded if first <= count < iterations), iterations)

@@ -1,0 +1,231 @@
+"""Plots of what was measured, drawn by matplotlib: for files, and for pages that are light or dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tungsten_dip.bench.methods import IN_TIME, NOISY, OIDN, OURS, PAPER, SAMPLES, SERIES
+from tungsten_dip.bench.table import Row, SetRows
+from tungsten_dip.buffers import replacing
+from tungsten_dip.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+METRICS = (
+    ("psnr", "PSNR in dB, more is better", False),
+    ("relmse", "relMSE, less is better", True),
+    ("flip", "FLIP, less is better", False),
+    ("hdrflip", "HDR-FLIP, less is better", False),
+)
+"""Attribute of `Comparison`, what it is called, and whether its axis is logarithmic."""
+
+MARKERS = dict(zip(SERIES, "oosD^v", strict=True))
+_JOINED = (OURS, IN_TIME, PAPER, SAMPLES, OIDN)
+
+
+@dataclass(frozen=True)
+class Colors:
+    """Colours of a plot, ``series`` in the order of `SERIES`."""
+
+    ink: str
+    soft: str
+    line: str
+    series: tuple[str, ...]
+
+
+PRINTED = Colors(
+    "#0b0b0b", "#52514e", "#dddcd8", ("#2a78d6", "#c2410c", "#0f7b6c", "#a21caf", "#8a6500", "#5b5b66")
+)
+
+# Stand for the page's own colours, which differ in light and dark; `_for_page` puts those in their place.
+_PAGE = Colors("#010101", "#010102", "#010103", tuple(f"#0102{index:02x}" for index in range(len(SERIES))))
+_VARIABLES = {
+    _PAGE.ink: "var(--ink)",
+    _PAGE.soft: "var(--soft)",
+    _PAGE.line: "var(--line)",
+    **{color: f"var(--series-{index + 1})" for index, color in enumerate(_PAGE.series)},
+}
+
+
+def require_matplotlib() -> None:
+    """Raise InputError if matplotlib is not installed: a plot comes after long work."""
+    if find_spec("matplotlib") is None:
+        raise InputError("plots need matplotlib; install it with: pip install 'tungsten-dip[bench]'")
+
+
+def write_pareto_plot(path: Path, found: Sequence[SetRows]) -> None:
+    """Write one row of plots for every set, as .svg or .png."""
+    with _figure(4.2 * len(METRICS), 3.6 * len(found) + 0.5) as figure:
+        grid = figure.subplots(len(found), len(METRICS), squeeze=False)
+        drawn = []
+        for axes_of_set, each in zip(grid, found, strict=True):
+            for axes, (name, title, logarithmic) in zip(axes_of_set, METRICS, strict=True):
+                drawn.append((axes, _draw(axes, each.rows, name, logarithmic, PRINTED)))
+                axes.set_title(f"{each.bench_set.name}: {title}", fontsize=9, loc="left", color=PRINTED.ink)
+        handles, names = _handles(grid[0][0])
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False)
+        _write_marks(figure, drawn)
+        save(figure, path)
+
+
+def pareto_svgs(each: SetRows) -> Iterator[tuple[str, str]]:
+    """Yield (title, SVG in the page's colours) for every metric of a set."""
+    for name, title, logarithmic in METRICS:
+        with _figure(4.8, 3.2) as figure:
+            axes = figure.subplots()
+            _write_marks(figure, [(axes, _draw(axes, each.rows, name, logarithmic, _PAGE))])
+            yield title, _for_page(figure, title)
+
+
+def legend_html(rows: Sequence[Row]) -> str:
+    """Return the names of the series that occur, each in its colour."""
+    present = [series for series in SERIES if any(row.series == series for row in rows)]
+    items = (
+        f'<span style="color: var(--series-{SERIES.index(series) + 1})">\u25cf {series}</span>'
+        for series in present
+    )
+    return f'<p class="legend">{" ".join(items)}</p>'
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure whole or not at all, the same bytes for the same figure."""
+    with replacing(path) as temporary:
+        metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+        figure.savefig(temporary, facecolor="white", metadata=metadata)
+
+
+@contextmanager
+def _figure(width: float, height: float) -> Iterator[Figure]:
+    """Yield a figure of that many inches."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "tungsten-dip", "font.size": 9}):
+        yield Figure(figsize=(width, height), layout="constrained", dpi=144)
+
+
+def style(axes: Axes, colors: Colors) -> None:
+    """Take from axes all that carries nothing."""
+    axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
+    axes.patch.set_visible(False)
+    axes.tick_params(which="both", length=0, labelcolor=colors.soft)
+    axes.grid(color=colors.line, linewidth=0.7)
+    axes.set_axisbelow(True)
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """A word in a colour that belongs beside a point of a plot."""
+
+    word: str
+    seconds: float
+    value: float
+    color: str
+
+
+def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, colors: Colors) -> list[_Mark]:
+    """Draw one metric of every row over seconds, and return what is to be written beside the points."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    style(axes, colors)
+    axes.set_xscale("log")
+    axes.set_yscale("log" if logarithmic else "linear")
+    axes.set_xlabel("seconds", color=colors.soft, labelpad=1)
+    marks = []
+    for series, color in zip(SERIES, colors.series, strict=True):
+        of_series = ((row, getattr(row.median, metric)) for row in rows if row.series == series)
+        known = [(row, value) for row, value in of_series if value is not None]
+        for row, value in known:
+            if row.median.seconds is None:
+                axes.axhline(value, color=color, linewidth=1, linestyle="--", label=series)
+        timed = sorted(
+            (row.median.seconds, value, row.mark) for row, value in known if row.median.seconds is not None
+        )
+        if timed:
+            seconds, values, _ = zip(*timed, strict=True)
+            line = "-" if series in _JOINED else ""
+            axes.plot(seconds, values, line, color=color, marker=MARKERS[series], ms=4, lw=1.2, label=series)
+            marks += [_Mark(mark, second, value, color) for second, value, mark in timed]
+    axes.margins(x=0.12, y=0.12)
+    _end_at_noisy(axes, rows, metric)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    if logarithmic:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    return marks
+
+
+def _end_at_noisy(axes: Axes, rows: Sequence[Row], metric: str) -> None:
+    """Leave out what is worse than doing nothing, which would press all the rest together."""
+    noisy = next((getattr(row.median, metric) for row in rows if row.label == NOISY), None)
+    if noisy is None:
+        return
+    low, high = axes.get_ylim()
+    if metric == "psnr":
+        axes.set_ylim(max(low, min(noisy, high - 1)), high)
+    else:
+        axes.set_ylim(low, min(high, max(noisy, low * 1.1)))
+
+
+def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) -> None:
+    """Write the marks beside their points, each where the least is in the way."""
+    figure.draw_without_rendering()
+    point = figure.dpi / 72
+    for axes, marks in drawn:
+        box = axes.get_window_extent()
+        places = [axes.transData.transform((mark.seconds, mark.value)) for mark in marks]
+        taken = [(x - 3 * point, y - 3 * point, x + 3 * point, y + 3 * point) for x, y in places]
+        for mark, (x, y) in zip(marks, places, strict=True):
+            if not mark.word or not box.y0 <= y <= box.y1:
+                continue
+            width, height = 4.6 * len(mark.word) * point, 8 * point
+            free = [
+                (left, bottom, left + width, bottom + height)
+                for bottom in (y + 2 * point, y - 2 * point - height)
+                for left in (x + 3 * point, x - 3 * point - width)
+                if box.x0 <= left and left + width <= box.x1 and bottom >= box.y0
+            ]
+            if not free:
+                continue
+            best = min(free, key=lambda place: sum(_overlap(place, other) for other in taken))
+            taken.append(best)
+            left, bottom = axes.transAxes.inverted().transform(best[:2])
+            axes.text(left, bottom, mark.word, transform=axes.transAxes, color=mark.color, fontsize=7)
+
+
+def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Return the area that two boxes (left, bottom, right, top) share."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
+
+
+def _handles(axes: Axes) -> tuple[list[Artist], list[str]]:
+    handles, names = axes.get_legend_handles_labels()
+    first = {name: handle for handle, name in zip(reversed(handles), reversed(names), strict=True)}
+    return list(reversed(first.values())), list(reversed(first.keys()))
+
+
+def _for_page(figure: Figure, title: str) -> str:
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
+    svg = stream.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    for color, variable in _VARIABLES.items():
+        svg = svg.replace(color, variable)
+    view = re.search(r'viewBox="[^"]*"', svg)
+    assert view is not None
+    head = f'<svg {view[0]} role="img" aria-label="{title} over seconds">'
+    return re.sub(r"<svg[^>]*>", lambda _: head, svg, count=1)

@@ -1,0 +1,124 @@
+"""Measurements in a CSV file that grows row by row, so that a run goes on where the last one stopped."""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from tungsten_dip.buffers import replacing
+from tungsten_dip.errors import InputError
+
+
+@dataclass(frozen=True)
+class Key:
+    """What was measured: measurements with equal keys are of the same thing.
+
+    ``settings`` are those that are not the default, ``version`` that of the package, ``input`` the digest of
+    the set.
+    """
+
+    set: str
+    method: str
+    settings: str
+    version: str
+    input: str
+    machine: str
+    repeat: int
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One row: the key, what it took and how far from the reference it is (`report.metrics.Comparison`).
+
+    ``seconds`` is None where an image was saved and nobody knows what it took. ``loss`` and ``psnr_noisy``
+    are those of the published method's iteration.
+    """
+
+    key: Key
+    seconds: float | None
+    iterations: int | None
+    psnr: float
+    relmse: float
+    ssim: float | None
+    flip: float
+    hdrflip: float | None
+    nonfinite: int
+    mean_ratio: float | None
+    loss: float | None = None
+    psnr_noisy: float | None = None
+
+
+VALUES = tuple(field.name for field in fields(Measurement) if field.name != "key")
+COLUMNS = (*(field.name for field in fields(Key)), *VALUES)
+_INTEGERS = ("repeat", "iterations", "nonfinite")
+
+
+class Results:
+    """The measurements of a file. What `add` has returned from is on disk, whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Read what the file holds; it need not exist.
+
+        Raises InputError if it exists and is no file of measurements.
+        """
+        self._path = path
+        self._by_key: dict[Key, Measurement] = {}
+        if path.exists():
+            self._by_key = {row.key: row for row in _read(path)}
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._by_key
+
+    def add(self, measurements: Iterable[Measurement]) -> None:
+        """Add rows and write the file anew, whole or not at all."""
+        self._by_key |= {row.key: row for row in measurements}
+        with replacing(self._path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            for row in self._by_key.values():
+                values = asdict(row)
+                writer.writerow({**values.pop("key"), **values})
+
+    def medians(self, key: Key, repeats: int) -> Measurement:
+        """Return the medians of every value over the repeats 0, 1, ... of a key that have been measured."""
+        keys = [replace(key, repeat=index) for index in range(repeats)]
+        rows = [self._by_key[each] for each in keys if each in self._by_key]
+        return Measurement(
+            keys[0], **{name: _median([getattr(row, name) for row in rows]) for name in VALUES}
+        )
+
+
+def _median(values: Sequence[Any]) -> Any:
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    median = statistics.median(known)
+    return int(median) if isinstance(known[0], int) else median
+
+
+def _read(path: Path) -> list[Measurement]:
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise ValueError("its columns are others")
+            return [_measurement(row) for row in reader]
+    except (ValueError, TypeError, csv.Error) as error:
+        raise InputError(
+            f"{path}: expected measurements that an earlier run wrote, but {error}; choose another folder"
+        ) from error
+
+
+def _measurement(row: dict[str, str]) -> Measurement:
+    values: dict[str, Any] = {}
+    for name, text in row.items():
+        if name in VALUES or name == "repeat":
+            values[name] = None if text == "" else int(text) if name in _INTEGERS else float(text)
+        else:
+            values[name] = text
+    key = Key(**{field.name: values.pop(field.name) for field in fields(Key)})
+    return Measurement(key, **values)

@@ -1,0 +1,88 @@
+"""What is measured on: buffers that were saved, and the reference that their denoised image should be."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tungsten_dip.buffers import FloatImage, RenderBuffers, read_buffers, read_image
+from tungsten_dip.errors import InputError
+
+REFERENCE = "reference.exr"
+NFOR = "nfor.exr"
+
+
+@dataclass(frozen=True)
+class BenchSet:
+    """Noisy buffers and their reference, linear radiance of shape (height, width, 3).
+
+    ``name`` is made of the last two parts of the path. ``nfor`` is what Tungsten's own denoiser made of these
+    buffers, where that was saved beside them. ``digest`` identifies all values.
+    """
+
+    name: str
+    buffers: RenderBuffers
+    reference: FloatImage
+    nfor: FloatImage | None
+    digest: str
+
+
+def read_sets(texts: Sequence[str]) -> list[BenchSet]:
+    """Read every ``INPUT`` or ``INPUT=REFERENCE``.
+
+    ``INPUT`` is whatever `read_buffers` takes. Where no reference is named, it is the file ``reference.exr``
+    in the folder of the buffers or the folder above.
+
+    Raises InputError if a file cannot be read, there is no reference, its size is another one, or two sets
+    have one name.
+    """
+    sets = [_read_set(text) for text in texts]
+    names = [each.name for each in sets]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{name}: two sets end in that path; rename a folder, or measure them apart")
+    return sets
+
+
+def _read_set(text: str) -> BenchSet:
+    path, reference_path = _paths(text)
+    buffers, reference = read_buffers(path), read_image(reference_path)
+    if reference.shape != buffers.color.mean.shape:
+        raise InputError(
+            f"{reference_path}: expected the size of {path}, {buffers.width} x {buffers.height} with 3 "
+            f"channels, got {reference.shape[1]} x {reference.shape[0]} with {reference.shape[2]}"
+        )
+    if not np.isfinite(reference).all():
+        raise InputError(f"{reference_path}: expected a finite reference, got NaN or Inf; render it anew")
+    nfor_path = _folder(path) / NFOR
+    nfor = read_image(nfor_path) if nfor_path.exists() else None
+    resolved = path.resolve()
+    digest = hashlib.sha256()
+    images = [reference, *(plane for _, buffer in buffers.quantities() for _, plane in buffer.planes())]
+    for image in images if nfor is None else [*images, nfor]:
+        digest.update(np.ascontiguousarray(image).tobytes())
+    name = "/".join((resolved.parent.name, resolved.stem)).lstrip("/")
+    return BenchSet(name, buffers, reference, nfor, digest.hexdigest()[:12])
+
+
+def _paths(text: str) -> tuple[Path, Path]:
+    """Take apart ``INPUT=REFERENCE``; a file that has ``=`` in its name is an input."""
+    path, separator, reference = text.rpartition("=")
+    if separator and not Path(text).exists():
+        return Path(path), Path(reference)
+    folder = _folder(Path(text))
+    for candidate in (folder / REFERENCE, folder.resolve().parent / REFERENCE):
+        if candidate.exists():
+            return Path(text), candidate
+    raise InputError(
+        f"{text}: no reference to measure against; save one as {folder / REFERENCE}, or name one as "
+        f"{text}=REFERENCE.exr"
+    )
+
+
+def _folder(path: Path) -> Path:
+    return path if path.is_dir() else path.parent

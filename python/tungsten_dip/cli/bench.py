@@ -1,0 +1,100 @@
+"""The commands ``tungsten-dip bench ...``: what accuracy costs in time, measured on this machine."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tungsten_dip.cli.console import duration, progress_on_stderr
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
+
+SETS_HELP = (
+    "buffers as for denoise, with their reference as INPUT=REFERENCE.exr, or with a reference.exr in their "
+    "folder or the one above"
+)
+
+
+def add_bench(commands: _SubParsersAction[Any]) -> None:
+    """Add ``bench`` and its own commands."""
+    bench = commands.add_parser(
+        "bench", help="measure accuracy against time, and against the published method"
+    )
+    benches = bench.add_subparsers(required=True, metavar="WHAT", title="what to measure")
+
+    pareto = benches.add_parser("pareto", help="our fits, other denoisers and more samples, on the same axes")
+    pareto.set_defaults(action=_pareto)
+    add = pareto.add_argument
+    _add_common(pareto, "bench")
+    add("--methods", metavar="M,M,...", type=_names, help="of presets, budgets, paper, oidn, nfor, samples")
+    add("--presets", metavar="P,P,...", type=_names, help="which presets (default: draft,balanced,final)")
+    add(
+        "--budgets", metavar="S,S,...", type=_durations, help="time budgets of final (default: 2s,5s,10s,20s)"
+    )
+    add("--paper-iterations", metavar="N", type=int, help="of the published method (default: 3000)")
+    add("--nfor-seconds", metavar="S", type=duration, help="what the nfor.exr beside the buffers took")
+    add("--denoiser", metavar="PATH", type=Path, help="Tungsten's command denoiser, to measure NFOR with")
+    add(
+        "--scene",
+        metavar="SCENE",
+        type=Path,
+        action="append",
+        default=[],
+        help="the scene of a SET, in their order: renders more samples instead of denoising",
+    )
+    add("--repeats", metavar="N", type=int, help="how often every method is run, in turns (default: 3)")
+
+
+def _add_common(parser: argparse.ArgumentParser, folder: str) -> None:
+    add = parser.add_argument
+    add("sets", metavar="SET", nargs="+", help=SETS_HELP)
+    add(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        type=Path,
+        default=Path(folder),
+        help=f"where results are, and a run goes on (default: {folder})",
+    )
+    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+    add("--json", action="store_true", help="print one JSON object on stdout, nothing else")
+
+
+def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from tungsten_dip.bench.methods import Plan
+    from tungsten_dip.bench.pareto import run_pareto
+    from tungsten_dip.bench.sets import read_sets
+    from tungsten_dip.bench.table import markdown_table
+
+    given = {
+        "kinds": options.methods,
+        "presets": options.presets,
+        "budgets_s": options.budgets,
+        "paper_iterations": options.paper_iterations,
+        "nfor_s": options.nfor_seconds,
+        "denoiser": options.denoiser,
+        "scenes": tuple(options.scene),
+        "repeats": options.repeats,
+        "threads": options.threads,
+    }
+    plan = Plan(**{name: value for name, value in given.items() if value is not None})
+    sets = read_sets(options.sets)
+    with progress_on_stderr("measuring") as progress:
+        found = run_pareto(sets, plan, options.output, progress)
+    facts = {
+        each.bench_set.name: [{"label": row.label, **asdict(row.median)} for row in each.rows]
+        for each in found
+    }
+    tables = "\n\n".join(f"{each.bench_set.name}\n\n{markdown_table(each)}" for each in found)
+    return facts, f"{tables}\n\n{options.output / 'page.html'} shows them"
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
+def _durations(text: str) -> tuple[float, ...]:
+    return tuple(duration(part) for part in text.split(","))
