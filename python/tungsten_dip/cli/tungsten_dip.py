@@ -1,4 +1,4 @@
-"""The command ``tungsten-dip``: denoise saved buffers, look into scenes and files, compare images."""
+"""The command ``tungsten-dip``: denoise saved buffers, look into scenes and files, compare, measure."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from tungsten_dip.buffers import (
     write_denoised,
     write_image,
 )
+from tungsten_dip.cli.bench import add_bench
 from tungsten_dip.cli.console import Parser, json_on_stdout, remarks_from_log, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
@@ -95,6 +96,8 @@ def _parser() -> argparse.ArgumentParser:
     compare.set_defaults(action=_compare)
     compare.add_argument("image", metavar="IMAGE", type=Path)
     compare.add_argument("reference", metavar="REFERENCE", type=Path)
+
+    add_bench(commands)
 
     for command in (denoise, inspect, compare):
         command.add_argument(
