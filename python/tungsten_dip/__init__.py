@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
+    from tungsten_dip.fit.model import Model
     from tungsten_dip.fit.settings import FitResult, FitSettings
     from tungsten_dip.hosts import render
+    from tungsten_dip.onnx import infer, load_model, save_model
     from tungsten_dip.report.metrics import Comparison, compare
     from tungsten_dip.scene.parse import load_scene
 
@@ -31,12 +33,16 @@ _MODULE_BY_NAME = {
     "FitResult": "fit.settings",
     "FitSettings": "fit.settings",
     "InputError": "errors",
+    "Model": "fit.model",
     "RenderBuffers": "buffers.model",
     "compare": "report.metrics",
     "denoise": "fit",
+    "infer": "onnx",
+    "load_model": "onnx",
     "load_scene": "scene.parse",
     "read_buffers": "buffers.read",
     "render": "hosts",
+    "save_model": "onnx",
     "write_denoised": "buffers.write",
 }
 
@@ -46,13 +52,17 @@ __all__ = [
     "FitResult",
     "FitSettings",
     "InputError",
+    "Model",
     "RenderBuffers",
     "__version__",
     "compare",
     "denoise",
+    "infer",
+    "load_model",
     "load_scene",
     "read_buffers",
     "render",
+    "save_model",
     "write_denoised",
 ]
 

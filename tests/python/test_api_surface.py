@@ -13,13 +13,17 @@ NAMES = {
     "FitResult",
     "FitSettings",
     "InputError",
+    "Model",
     "RenderBuffers",
     "__version__",
     "compare",
     "denoise",
+    "infer",
+    "load_model",
     "load_scene",
     "read_buffers",
     "render",
+    "save_model",
     "write_denoised",
 }
 

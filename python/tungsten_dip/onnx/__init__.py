@@ -1,0 +1,7 @@
+"""Fitted networks as ONNX files: saved, loaded, used and trained further by onnxruntime, without torch."""
+
+from tungsten_dip.fit.model import Model
+from tungsten_dip.onnx.file import load_model, save_model
+from tungsten_dip.onnx.infer import infer
+
+__all__ = ["Model", "infer", "load_model", "save_model"]

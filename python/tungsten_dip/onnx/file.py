@@ -1,0 +1,312 @@
+"""Models as ONNX files, and files that nobody has to trust.
+
+A file holds the graph, its weights, and one metadata property in JSON. Reading it takes the weights and the
+property alone: the graph that runs is always built anew from them, and a file whose own graph is another one
+is refused. Nothing in a file names code, and nothing outside of it is read.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from onnx import TensorProto
+
+from tungsten_dip.buffers.atomic import check_writable, replacing
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.evidence import Layout, Standardisation
+from tungsten_dip.fit.model import Kind, Model
+from tungsten_dip.fit.pilots import Pilot
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.onnx.builder import array_from_tensor
+from tungsten_dip.onnx.graph import graph_of
+
+LARGEST_FILE_BYTES = 64 << 20
+LARGEST_STRUCTURE_BYTES = 1 << 20
+"""All but the weights: bounds what a parser makes of them."""
+
+_FORMAT = 1
+"""Raised whenever another graph is written."""
+
+_PROPERTY = "tungsten_dip"
+_SETTINGS = ("preset", "iterations", "network", "inputs", "scheme", "channels", "seed")
+"""The settings that say what a network is; the others say where and how long it was fitted."""
+
+_NO_ONNX = "expected an ONNX model, this is none or cut short; save it anew with --save-model"
+_MOST_PARTS = 1 << 16
+_LARGEST_COUNT = 1 << 16
+_LARGEST_RADIUS = 64
+_MOST_CANDIDATES = 64
+
+T = TypeVar("T")
+
+
+def save_model(path: str | Path, model: Model) -> None:
+    """Write a model as an ONNX file, whole or not at all.
+
+    Raises InputError if the model is larger than `load_model` accepts, or the file cannot be written.
+    """
+    path = Path(path)
+    check_writable(path, (".onnx",))
+    content = proto_from_model(model).SerializeToString(deterministic=True)
+    if len(content) > LARGEST_FILE_BYTES:
+        raise InputError(
+            f"{path}: expected a model of at most {_mib(LARGEST_FILE_BYTES)}, this has {_mib(len(content))}; "
+            f"fit one with fewer channels"
+        )
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def load_model(path: str | Path) -> Model:
+    """Read a model that `save_model` wrote.
+
+    Raises InputError if the file is anything else.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: expected a file, this is none")
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    try:
+        return _model_from_bytes(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def proto_from_model(model: Model) -> onnx.ModelProto:
+    """Return the model as ONNX.
+
+    Raises InputError if the model's weights are not those of its network.
+    """
+    facts: dict[str, Any] = {
+        "format": _FORMAT,
+        "version": model.version,
+        "kind": model.kind,
+        "planes": model.planes,
+        "settings": {name: getattr(model.settings, name) for name in _SETTINGS},
+        "estimated_relmse": model.estimated_relmse,
+        "source_sha256": model.source_sha256,
+    }
+    if model.layout is not None:
+        facts["layout"] = asdict(model.layout)
+    return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
+
+
+def _model_from_bytes(content: bytes) -> Model:
+    if len(content) > LARGEST_FILE_BYTES:
+        raise InputError(f"expected a model of at most {_mib(LARGEST_FILE_BYTES)}, this is larger")
+    _check_structure(memoryview(content))
+    proto = onnx.ModelProto()
+    try:
+        proto.ParseFromString(content)
+    except (DecodeError, RecursionError):
+        raise InputError(_NO_ONNX) from None
+    facts = _facts(proto)
+    model = _model_from_facts(facts, {t.name: t for t in proto.graph.initializer})
+    _check_same(proto, proto_from_model(model))
+    return model
+
+
+def _check_structure(content: memoryview) -> None:
+    """Bound what a parser would allocate: only the raw bytes of weights may be many.
+
+    Walks the top levels of the file (protocol buffers' wire format): model, graph, initializers.
+    """
+    budget = itertools.islice(itertools.count(), _MOST_PARTS)
+    weights = 0
+    for number, value in _parts(content, budget):
+        if number != onnx.ModelProto.GRAPH_FIELD_NUMBER:
+            continue
+        for number_in_graph, part in _parts(value, budget):
+            if number_in_graph == onnx.GraphProto.INITIALIZER_FIELD_NUMBER:
+                raw = onnx.TensorProto.RAW_DATA_FIELD_NUMBER
+                weights += sum(len(data) for n, data in _parts(part, budget) if n == raw)
+    if len(content) - weights > LARGEST_STRUCTURE_BYTES:
+        raise InputError(
+            f"expected at most {_mib(LARGEST_STRUCTURE_BYTES)} beside the weights, found "
+            f"{_mib(len(content) - weights)}; this is no model of tungsten-dip"
+        )
+
+
+def _parts(message: memoryview, budget: Iterator[int]) -> Iterator[tuple[int, memoryview]]:
+    """Yield number and value of every field that has a length; every field uses up one of the budget."""
+    at = 0
+
+    def varint() -> int:
+        nonlocal at
+        value = shift = 0
+        while at < len(message) and shift < 64:
+            byte = message[at]
+            at += 1
+            value |= (byte & 0x7F) << shift
+            shift += 7
+            if byte < 0x80:
+                return value
+        raise InputError(_NO_ONNX)
+
+    while at < len(message):
+        if next(budget, None) is None:
+            raise InputError("expected a model of tungsten-dip, this has too many parts to be one")
+        key = varint()
+        length = {0: 0, 1: 8, 2: -1, 5: 4}.get(key & 7)
+        if key & 7 == 0:
+            varint()
+        if length == -1:
+            length = varint()
+            yield key >> 3, message[at : at + length]
+        if length is None or length > len(message) - at:
+            raise InputError(_NO_ONNX)
+        at += length
+
+
+def _facts(proto: onnx.ModelProto) -> dict[str, Any]:
+    texts = [p.value for p in proto.metadata_props if p.key == _PROPERTY]
+    if len(texts) != 1:
+        raise InputError("expected a model that tungsten-dip wrote, this is another one; use --save-model")
+    try:
+        facts = json.loads(texts[0], parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        raise InputError("expected metadata in JSON, found none that can be read") from None
+    if not isinstance(facts, dict) or facts.get("format") != _FORMAT:
+        found = facts.get("format") if isinstance(facts, dict) else None
+        raise InputError(
+            f"expected format {_FORMAT}, found {found!r:.40}; save the model anew with this version"
+        )
+    return facts
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(name)
+
+
+def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) -> Model:
+    kind = _checked("kind", facts.get("kind"), Kind)
+    chosen = _object("settings", facts.get("settings"))
+    hints = get_type_hints(FitSettings)
+    settings = FitSettings(**{name: _checked(name, chosen.get(name), hints[name]) for name in _SETTINGS})
+    relmse = _checked("estimated_relmse", facts.get("estimated_relmse"), float | None)
+    planes = _checked("planes", facts.get("planes"), tuple[str, ...])
+    version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))
+    layout = standardisation = None
+    if kind == "pointwise":
+        layout = _layout(_object("layout", facts.get("layout")))
+        if layout.planes != planes:
+            raise InputError("the planes are not those of the pilots; this version names them otherwise")
+        mean, std = (_array(tensors.pop(n, None), n, dtype) for n, dtype in (("mean", "f8"), ("std", "f4")))
+        if not (std > 0).all():
+            raise InputError("std: expected numbers above 0")
+        standardisation = Standardisation(mean.ravel(), std.ravel())
+    elif settings.network != kind:
+        raise InputError(f"expected the network {settings.network}, as the settings say, found {kind}")
+    if (settings.preset == "paper") != (kind != "pointwise"):
+        raise InputError(f"expected another network with the preset {settings.preset} than {kind}")
+    # Other initializers are constants of the graph, which the comparison of the graphs checks.
+    weights = {
+        name: _array(tensor, name, "f4")
+        for name, tensor in tensors.items()
+        if name.endswith((".weight", ".bias"))
+    }
+    return Model(kind, planes, weights, settings, relmse, source, layout, standardisation, version)
+
+
+def _layout(facts: dict[str, Any]) -> Layout:
+    given = facts.get("pilots")
+    if not isinstance(given, list):
+        raise InputError("pilots: expected a list")
+    pilots = []
+    for values in given:
+        pilot = _object("pilots", values)
+        hints = get_type_hints(Pilot)
+        if pilot.keys() != {field.name for field in fields(Pilot)}:
+            raise InputError(f"pilots: expected {', '.join(hints)}, found {', '.join(pilot)}"[:200])
+        pilots.append(Pilot(**{name: _checked(name, pilot[name], hints[name]) for name in hints}))
+        radius, step = pilots[-1].radius, pilots[-1].step
+        if not 0 < step <= radius <= _LARGEST_RADIUS or radius % step:
+            raise InputError(f"pilots: expected a radius up to {_LARGEST_RADIUS}, a multiple of step")
+    features = _checked("features", facts.get("features"), tuple[str, ...])
+    candidates, reference = (_checked(n, facts.get(n), int) for n in ("candidates", "reference"))
+    layout = Layout(features, tuple(pilots), candidates, reference)
+    if not pilots or not 0 <= candidates <= _MOST_CANDIDATES or not 0 < reference < layout.choices:
+        raise InputError("layout: expected a pilot and a reference among the pilots")
+    return layout
+
+
+def _object(name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{name}: expected an object")
+    return value
+
+
+def _checked(name: str, value: Any, hint: Any) -> Any:
+    """Return a value of JSON as what a type hint asks for."""
+    if get_origin(hint) is tuple:
+        if isinstance(value, list) and len(value) <= _LARGEST_COUNT:
+            return tuple(_checked(name, item, get_args(hint)[0]) for item in value)
+    elif get_origin(hint) is Literal:
+        if isinstance(value, str) and value in get_args(hint):
+            return value
+    elif isinstance(hint, UnionType):
+        if value is None:
+            return None
+        return _checked(name, value, next(a for a in get_args(hint) if a is not type(None)))
+    elif hint is float:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            return value
+    elif hint is int:
+        if type(value) is int and 0 <= value < 1 << 63:
+            return value
+    elif isinstance(value, hint):
+        return value
+    raise InputError(f"{name}: found {value!r:.40}, which tungsten-dip does not write")
+
+
+def _array(tensor: TensorProto | None, name: str, dtype: str) -> np.ndarray[Any, Any]:
+    """Return an initializer's values, with no more memory than the file has bytes for them."""
+    if tensor is None:
+        raise InputError(f"{name}: expected a weight of that name, found none")
+    expected = TensorProto.DOUBLE if dtype == "f8" else TensorProto.FLOAT
+    if tensor.data_location != TensorProto.DEFAULT or tensor.external_data:
+        raise InputError(f"{name}: expected weights within the file, these are in another one")
+    if tensor.data_type != expected:
+        raise InputError(f"{name}: expected {dtype} numbers, found type {tensor.data_type}")
+    count = math.prod(tensor.dims) if all(0 < d <= _LARGEST_COUNT for d in tensor.dims) else -1
+    if len(tensor.dims) > 4 or count * np.dtype(dtype).itemsize != len(tensor.raw_data):
+        raise InputError(f"{name}: expected raw data of the shape that it names, found other data")
+    array = array_from_tensor(tensor)
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: expected finite weights, found NaN or Inf")
+    return array
+
+
+def _check_same(found: onnx.ModelProto, expected: onnx.ModelProto) -> None:
+    """Raise InputError unless the file's graph is the very one that the model's weights belong to."""
+    if found.SerializeToString(deterministic=True) == expected.SerializeToString(deterministic=True):
+        return
+    domains = [entry.domain for entry in found.opset_import]
+    operators = [[node.op_type for node in proto.graph.node] for proto in (found, expected)]
+    what = "it differs in its constants or attributes"
+    if domains != [""]:
+        what = f"it asks for operators of the domains {domains!r:.60}"
+    elif found.functions or found.training_info or found.graph.sparse_initializer:
+        what = "it holds functions, training information or sparse weights"
+    elif operators[0] != operators[1]:
+        strange = [name for name in operators[0] if name not in operators[1]]
+        what = f"it computes {strange[0]!r:.40}" if strange else "it has other operators or another order"
+    raise InputError(f"the graph is not the one that tungsten-dip writes for these weights: {what}")
+
+
+def _mib(size: int) -> str:
+    return f"{size / (1 << 20):.1f} MiB"

@@ -1,0 +1,154 @@
+"""Denoise with a network that is fitted already: numpy, the C++ core and onnxruntime, no torch."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.evidence import (
+    PLANES_RADIUS,
+    Evidence,
+    Halves,
+    checked_candidates,
+    evidence_from_buffers,
+    planes_of_half,
+    result_from_fused,
+)
+from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
+from tungsten_dip.fit.model import Model, check_planes, source_sha256
+from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.training import Training, examples_from_evidence, train
+from tungsten_dip.onnx.graph import graph_of
+from tungsten_dip.onnx.sessions import session_from_proto
+from tungsten_dip.onnx.training_graph import OnnxNetwork
+from tungsten_dip.progress import Progress, silent
+
+_LOG = logging.getLogger(__name__)
+
+_BAND_PIXELS = 1 << 18
+
+
+def infer(
+    model: Model,
+    buffers: RenderBuffers,
+    threads: int | None = None,
+    progress: Progress = silent,
+    candidates: Sequence[Halves] = (),
+    refit_steps: int = 0,
+) -> FitResult:
+    """Denoise one image with a fitted network, by onnxruntime alone.
+
+    ``buffers`` and ``candidates`` are as in `tungsten_dip.denoise`; the features, and how many candidates,
+    are those of the fit. ``threads`` None uses every core. With ``refit_steps``, a pointwise network is first
+    trained further on this image, as by a warm start, for so many steps at most; the result's ``model`` is
+    then the refined one. A network of the preset paper gives the image by itself, and no error is known.
+
+    Raises InputError if the image is empty, the model does not fit it, or refit_steps cannot be done.
+    """
+    if buffers.color.mean.size == 0:
+        raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
+    if refit_steps < 0:
+        raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
+    # A FitSettings checks the threads as well.
+    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
+    given = checked_candidates(buffers, candidates)
+    buffers, mended = sanitize(buffers, threads)
+    if model.layout is not None:
+        result = _infer_fusion(model, buffers, settings, given, refit_steps, progress)
+    else:
+        if refit_steps or given:
+            raise InputError("a network of the preset paper takes neither candidates nor refit steps")
+        result = _infer_paper(model, buffers, settings, progress)
+    result = replace(result, notes=(*mended, *result.notes))
+    for note in result.notes:
+        _LOG.info(note)
+    return result
+
+
+def _infer_fusion(
+    model: Model,
+    buffers: RenderBuffers,
+    settings: FitSettings,
+    candidates: Sequence[Halves],
+    refit_steps: int,
+    progress: Progress,
+) -> FitResult:
+    started = time.perf_counter()
+    assert model.layout is not None
+    evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress)
+    if isinstance(evidence, FitResult):
+        return evidence
+    training = Training()
+    if refit_steps:
+        model, training = _refitted(model, evidence, settings, refit_steps, started, progress)
+    fused = _fused(model, evidence, settings.threads or 0)
+    result = result_from_fused(
+        evidence, fused, settings, started, training.steps_done, training.history, training.notes
+    )
+    if training.steps_done:
+        model = replace(
+            model,
+            settings=settings,
+            estimated_relmse=result.estimated_relmse,
+            source_sha256=source_sha256(buffers),
+        )
+    progress(1.0, "inferred")
+    return replace(result, model=model)
+
+
+def _refitted(
+    model: Model,
+    evidence: Evidence,
+    settings: FitSettings,
+    steps: int,
+    started: float,
+    progress: Progress,
+) -> tuple[Model, Training]:
+    assert model.standardisation is not None
+    standardisation = model.standardisation
+    examples, _ = examples_from_evidence(evidence, lambda _: standardisation)
+    network = OnnxNetwork(model.weights, examples, settings.threads or 0)
+    training = train(network, examples, evidence, settings, steps, started, progress, warm=True)
+    return replace(model, weights=network.weights()), training
+
+
+def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
+    """Return what the network makes of both halves, band by band of rows."""
+    session = session_from_proto(graph_of(model, metadata={}), threads)
+    height, width = evidence.mean.shape[:2]
+    rows = max(1, _BAND_PIXELS // width)
+    fused_a, fused_b = np.empty_like(evidence.mean), np.empty_like(evidence.mean)
+    for first in range(0, height, rows):
+        end = min(first + rows, height)
+        # The planes of a row come from the rows around it.
+        above, below = max(first - PLANES_RADIUS, 0), min(end + PLANES_RADIUS, height)
+        around, band = evidence.rows(above, below), evidence.rows(first, end)
+        for half, fused in enumerate((fused_a, fused_b)):
+            planes = [plane[first - above : end - above] for plane in planes_of_half(around, half)]
+            pilots = [pilot[half].transpose(2, 0, 1) for pilot in band.pilots]
+            feeds = {"inputs": np.stack(planes)[None], "pilots": np.stack(pilots)[None]}
+            fused[first:end] = session.run(["color"], feeds)[0][0].transpose(1, 2, 0)
+    return fused_a, fused_b
+
+
+def _infer_paper(
+    model: Model, buffers: RenderBuffers, settings: FitSettings, progress: Progress
+) -> FitResult:
+    started = time.perf_counter()
+    images = paper_images(buffers, settings)
+    check_planes(model, images.planes)
+    inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
+    # Norms of the whole image: no bands here.
+    session = session_from_proto(graph_of(model, metadata={}), settings.threads or 0)
+    ldr = session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0][0, :3].transpose(1, 2, 0)
+    color: FloatImage = np.ascontiguousarray(radiance_from_ldr(ldr))
+    progress(1.0, "inferred")
+    seconds = time.perf_counter() - started
+    return FitResult(color, settings, seconds, iterations=0, model=model, notes=images.notes)
