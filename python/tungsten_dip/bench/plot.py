@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tungsten_dip.bench.methods import IN_TIME, NOISY, OIDN, OURS, PAPER, SAMPLES, SERIES
+from tungsten_dip.bench.results import Measurement
+from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import Row, SetRows
-from tungsten_dip.buffers import replacing
+from tungsten_dip.buffers import FloatImage, replacing
 from tungsten_dip.errors import InputError
+from tungsten_dip.scene.tonemap import display_from_radiance
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -229,3 +232,32 @@ def _for_page(figure: Figure, title: str) -> str:
     assert view is not None
     head = f'<svg {view[0]} role="img" aria-label="{title} over seconds">'
     return re.sub(r"<svg[^>]*>", lambda _: head, svg, count=1)
+
+
+def write_iterations_plot(
+    path: Path,
+    bench_set: BenchSet,
+    medians: Sequence[Measurement],
+    images: Sequence[tuple[str, FloatImage]],
+) -> None:
+    """Write what iterations do to the published method's image: its PSNR as they go, and some images."""
+    shown = [("noisy", bench_set.buffers.color.mean), *images, ("reference", bench_set.reference)]
+    height, width = bench_set.reference.shape[:2]
+    with _figure(10, 3.2 + 10 / len(shown) * height / width) as figure:
+        grid = figure.add_gridspec(2, len(shown), height_ratios=(2.7, 10 / len(shown) * height / width))
+        axes = figure.add_subplot(grid[0, :])
+        style(axes, PRINTED)
+        axes.set_xscale("log")
+        counts = [median.iterations for median in medians]
+        for name, label, color in (("psnr_noisy", "to noisy", 1), ("psnr", "to reference", 0)):
+            values = [getattr(median, name) for median in medians]
+            axes.plot(counts, values, "o-", ms=4, lw=1.2, color=PRINTED.series[color], label=label)
+        axes.set_xlabel("iterations", color=PRINTED.soft)
+        axes.set_title(f"{bench_set.name}: PSNR in dB", fontsize=9, loc="left", color=PRINTED.ink)
+        axes.legend(frameon=False)
+        for column, (label, image) in enumerate(shown):
+            below = figure.add_subplot(grid[1, column])
+            below.imshow(display_from_radiance(image, "gamma"), interpolation="antialiased")
+            below.set_axis_off()
+            below.set_title(label, fontsize=9, color=PRINTED.ink)
+        save(figure, path)

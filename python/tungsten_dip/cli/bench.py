@@ -47,10 +47,28 @@ def add_bench(commands: _SubParsersAction[Any]) -> None:
     )
     add("--repeats", metavar="N", type=int, help="how often every method is run, in turns (default: 3)")
 
+    paper = benches.add_parser("paper", help="the published method's table of 13 rows, beside its figures")
+    paper.set_defaults(action=_paper)
+    add = paper.add_argument
+    _add_common(paper, "bench-paper", one=True)
+    add("--iterations", metavar="N", type=int, default=3000, help="of every row (default: 3000)")
+    add("--rows", metavar="N,N,...", type=_numbers, help="only these rows, from 1 to 13, and no figure")
+    add("--published", metavar="SCENE", help="the published scene: cornell-box (default), car2 or lamp")
 
-def _add_common(parser: argparse.ArgumentParser, folder: str) -> None:
+    iteration = benches.add_parser(
+        "iteration", help="the published method's iteration, against plain PyTorch"
+    )
+    iteration.set_defaults(action=_iteration)
+    add = iteration.add_argument
+    add("--size", metavar="WxH", type=_size, default=(512, 288), help="multiples of 32 (default: 512x288)")
+    add("--iterations", metavar="N", type=int, default=10, help="per repeat (default: 10)")
+    add("--repeats", metavar="N", type=int, default=5, help="in turns (default: 5)")
+    _add_threads_and_json(iteration)
+
+
+def _add_common(parser: argparse.ArgumentParser, folder: str, one: bool = False) -> None:
     add = parser.add_argument
-    add("sets", metavar="SET", nargs="+", help=SETS_HELP)
+    add("sets", metavar="SET", nargs=1 if one else "+", help=SETS_HELP)
     add(
         "-o",
         "--output",
@@ -59,8 +77,12 @@ def _add_common(parser: argparse.ArgumentParser, folder: str) -> None:
         default=Path(folder),
         help=f"where results are, and a run goes on (default: {folder})",
     )
-    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
-    add("--json", action="store_true", help="print one JSON object on stdout, nothing else")
+    _add_threads_and_json(parser)
+
+
+def _add_threads_and_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, nothing else")
 
 
 def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -92,9 +114,58 @@ def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return facts, f"{tables}\n\n{options.output / 'page.html'} shows them"
 
 
+def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from tungsten_dip.bench.paper_table import SCENES, run_paper_table
+    from tungsten_dip.bench.sets import read_sets
+
+    (bench_set,) = read_sets(options.sets)
+    with progress_on_stderr("fitting") as progress:
+        text = run_paper_table(
+            bench_set,
+            options.output,
+            scene=options.published or SCENES[0],
+            iterations=options.iterations,
+            rows=options.rows,
+            figure=options.rows is None,
+            threads=options.threads,
+            progress=progress,
+        )
+    return {"output": str(options.output), "table": text}, text
+
+
+def _iteration(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from tungsten_dip.bench.iteration import time_iterations, times_text
+
+    width, height = options.size
+    with progress_on_stderr("timing") as progress:
+        times = time_iterations(
+            width,
+            height,
+            iterations=options.iterations,
+            repeats=options.repeats,
+            threads=options.threads,
+            progress=progress,
+        )
+    return {**asdict(times), "speedup": times.speedup}, times_text(times, width, height, options.threads)
+
+
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
 def _durations(text: str) -> tuple[float, ...]:
     return tuple(duration(part) for part in text.split(","))
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected numbers such as 1,7,13, got '{text}'") from None
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"expected a size such as 512x288, got '{text}'")
+    return int(width), int(height)

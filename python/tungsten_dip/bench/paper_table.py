@@ -1,0 +1,246 @@
+"""The published method's table of 13 rows on a set with a reference, and what its iterations do."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tungsten_dip.bench.machine import machine_facts
+from tungsten_dip.bench.methods import PAPER, Method, Outcome, settings_text
+from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
+from tungsten_dip.bench.plot import require_matplotlib, write_iterations_plot
+from tungsten_dip.bench.results import Measurement
+from tungsten_dip.bench.runner import Runner, Task
+from tungsten_dip.bench.sets import BenchSet
+from tungsten_dip.bench.table import seconds_text
+from tungsten_dip.buffers import sanitize
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.inputs import paper_images
+from tungsten_dip.fit.paper import ITERATIONS
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.progress import Progress, silent
+
+_LOG = logging.getLogger(__name__)
+
+SCENES = ("cornell-box", "car2", "lamp")
+"""The scenes of which all 13 rows are published."""
+
+TOO_MANY = 10 / 3
+"""How far beyond the iterations of the table the figure goes: the published one shows 10000 beside 3000."""
+
+COLUMNS = (
+    "row",
+    "network",
+    "channels",
+    "input",
+    "scheme",
+    "seconds",
+    "loss",
+    "PSNR to noisy",
+    "PSNR to truth",
+    "published loss",
+    "published PSNR to noisy",
+    "published PSNR to truth",
+)
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """One row of the published tables I to III. PSNRs are in dB; their truth is an NFOR-denoised image."""
+
+    number: int
+    network: str
+    channels: str
+    inputs: str
+    scheme: str
+    loss: float
+    psnr_noisy: float
+    psnr_truth: float
+
+    def settings(self, iterations: int, threads: int | None) -> FitSettings:
+        """Return the settings of our fit of this row."""
+        fixed: dict[str, Any] = {"network": self.network, "inputs": self.inputs, "scheme": self.scheme}
+        if self.network == "skip":
+            fixed["channels"] = tuple(int(count) for count in self.channels.split("-"))
+        return FitSettings("paper", iterations=iterations, threads=threads, **fixed)
+
+
+def published_rows(scene: str) -> list[PublishedRow]:
+    """Return the 13 rows of a scene in their order.
+
+    Raises InputError if that scene has no such rows.
+    """
+    if scene not in SCENES:
+        raise InputError(f"published scene: expected one of {', '.join(SCENES)}, got {scene}")
+    text = resources.files(__package__).joinpath("published.csv").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    rows = [row for row in csv.DictReader(lines) if row["scene"] == scene]
+    return [
+        PublishedRow(
+            number,
+            row["network"],
+            row["channels"],
+            row["input"],
+            row["scheme"].lower(),
+            float(row["loss"]),
+            float(row["psnr_noisy_db"]),
+            float(row["psnr_truth_db"]),
+        )
+        for number, row in enumerate(rows, 1)
+    ]
+
+
+def run_paper_table(
+    bench_set: BenchSet,
+    folder: Path,
+    *,
+    scene: str = SCENES[0],
+    iterations: int = ITERATIONS,
+    rows: Sequence[int] | None = None,
+    figure: bool = True,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> str:
+    """Fit every row, and return the table in Markdown, the published figures of ``scene`` beside ours.
+
+    ``rows`` None takes all 13. The folder is one of a `Runner`, in which a run goes on where it stopped; in
+    the end it holds ``paper.md`` and ``paper.csv`` with the rows that are known, and, with ``figure``,
+    ``iterations.svg`` and ``iterations.png``.
+
+    A row that lacks its feature is left out, and the log says so.
+
+    Raises InputError if a row is not one of the 13.
+    """
+    if figure:
+        require_matplotlib()
+    published = published_rows(scene)
+    unknown = [number for number in rows or () if not 1 <= number <= len(published)]
+    if unknown:
+        raise InputError(f"rows: expected numbers from 1 to {len(published)}, got {unknown[0]}")
+    if iterations < 1:
+        raise InputError(f"iterations: expected a number above 0, got {iterations}")
+    runner = Runner(folder, threads)
+    chosen = [
+        row
+        for row in published
+        if (rows is None or row.number in rows)
+        and _can_be_fitted(bench_set, row, row.settings(iterations, threads))
+    ]
+    methods = {row.number: _row_method(bench_set, row, iterations, threads) for row in chosen}
+    curve = _curve_method(bench_set, iterations, threads)
+    tasks = [Task(bench_set, method) for method in (*methods.values(), *((curve,) if figure else ()))]
+    runner.run(runner.missing(tasks), progress)
+
+    found = [
+        (row, runner.median(bench_set, methods[row.number], methods[row.number].labels[0])) for row in chosen
+    ]
+    text = _markdown(bench_set, scene, iterations, found, threads)
+    runner.write_text("paper.md", text)
+    runner.write_text("paper.csv", _csv(found))
+    if figure:
+        medians = [runner.median(bench_set, curve, label) for label in curve.labels]
+        best = int(np.argmax([median.psnr for median in medians]))
+        images = [
+            (f"{medians[index].iterations} iterations", runner.image(bench_set, curve.labels[index]))
+            for index in sorted({0, best, len(medians) - 1})
+        ]
+        shown = [(label, image) for label, image in images if image is not None]
+        for suffix in ("svg", "png"):
+            write_iterations_plot(folder / f"iterations.{suffix}", bench_set, medians, shown)
+    return text
+
+
+def _can_be_fitted(bench_set: BenchSet, row: PublishedRow, settings: FitSettings) -> bool:
+    buffers, _ = sanitize(bench_set.buffers, settings.threads)
+    try:
+        paper_images(buffers, settings)
+    except InputError as error:
+        _LOG.warning("row %d is left out: %s", row.number, error)
+        return False
+    return True
+
+
+def _row_method(bench_set: BenchSet, row: PublishedRow, iterations: int, threads: int | None) -> Method:
+    label = f"row {row.number}"
+    return _method(bench_set, row.settings(iterations, threads), (iterations,), lambda count: label)
+
+
+def _curve_method(bench_set: BenchSet, iterations: int, threads: int | None) -> Method:
+    total = max(round(iterations * TOO_MANY), iterations + 1)
+    counts = checkpoints_up_to(total, first=min(10, iterations))
+    settings = FitSettings("paper", threads=threads)
+    return _method(bench_set, settings, counts, lambda count: f"after {count} iterations")
+
+
+def _method(
+    bench_set: BenchSet, settings: FitSettings, counts: Sequence[int], label_of: Callable[[int], str]
+) -> Method:
+    def run(repeat: int, progress: Progress) -> list[Outcome]:
+        return [
+            Outcome(label_of(p.iteration), p.color, p.seconds, p.iteration, p.loss, p.psnr_noisy)
+            for p in paper_curve(bench_set.buffers, settings, counts, progress)
+        ]
+
+    labels = tuple(label_of(count) for count in counts)
+    return Method(PAPER, labels, labels, settings_text(settings), run)
+
+
+def _markdown(
+    bench_set: BenchSet,
+    scene: str,
+    iterations: int,
+    found: Sequence[tuple[PublishedRow, Measurement]],
+    threads: int | None,
+) -> str:
+    header = [f"{name}, {scene}" if name.startswith("published") else name for name in COLUMNS]
+    lines = ["| " + " | ".join(header) + " |", "|--:|---|---|---|---" + "|--:" * 7 + "|"]
+    for row, ours in found:
+        cells = (
+            str(row.number),
+            row.network,
+            row.channels,
+            row.inputs,
+            row.scheme.upper(),
+            seconds_text(ours.seconds),
+            f"{ours.loss:.6f}",
+            f"{ours.psnr_noisy:.2f}",
+            f"{ours.psnr:.2f}",
+            f"{row.loss:.6f}",
+            f"{row.psnr_noisy:.2f}",
+            f"{row.psnr_truth:.2f}",
+        )
+        lines.append("| " + " | ".join(cells) + " |")
+    size = f"{bench_set.buffers.width} x {bench_set.buffers.height} pixels"
+    machine = "; ".join(f"{name} {value}" for name, value in machine_facts(threads))
+    return "\n".join(
+        [
+            f"{bench_set.name}, {size}, {iterations} iterations, PSNR in dB of displayed images.",
+            "",
+            *lines,
+            "",
+            "Loss and PSNR to noisy are of the last iteration's output, PSNR to truth is of the average of all. "
+            "The truth of the published figures is an NFOR-denoised image, ours is the set's reference.",
+            "",
+            f"Measured with: {machine}.",
+            "",
+        ]
+    )
+
+
+def _csv(found: Sequence[tuple[PublishedRow, Measurement]]) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(name.replace(" ", "_").lower() for name in COLUMNS)
+    for row, ours in found:
+        described = (row.number, row.network, row.channels, row.inputs, row.scheme)
+        measured = (ours.seconds, ours.loss, ours.psnr_noisy, ours.psnr)
+        writer.writerow((*described, *measured, row.loss, row.psnr_noisy, row.psnr_truth))
+    return stream.getvalue()

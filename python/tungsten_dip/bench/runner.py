@@ -1,0 +1,131 @@
+"""Runs methods that have not been run yet, and keeps what they gave as soon as they gave it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from tungsten_dip import __version__
+from tungsten_dip.bench.machine import machine_key
+from tungsten_dip.bench.methods import Method, Outcome
+from tungsten_dip.bench.results import Key, Measurement, Results
+from tungsten_dip.bench.sets import BenchSet
+from tungsten_dip.buffers import FloatImage, read_image, replacing, write_image
+from tungsten_dip.errors import InputError
+from tungsten_dip.progress import Progress
+from tungsten_dip.report.metrics import compare
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run of a method on a set."""
+
+    bench_set: BenchSet
+    method: Method
+    repeat: int = 0
+
+
+class Runner:
+    """A folder of measurements (``results.csv``) and of the images of their first repeats (``images``).
+
+    Measurements that an earlier run left there count if the settings, the package's version, the values of
+    the set and the machine are the same.
+    """
+
+    def __init__(self, folder: Path, threads: int | None) -> None:
+        """Open the folder, which is made if need be.
+
+        Raises InputError if it cannot be written or holds something else.
+        """
+        try:
+            (folder / "images").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another") from error
+        self._folder = folder
+        self._results = Results(folder / "results.csv")
+        self._machine = machine_key(threads)
+
+    def missing(self, tasks: Sequence[Task]) -> list[Task]:
+        """Return those of the tasks that are yet to be run."""
+        return [
+            task
+            for task in tasks
+            if any(self._key(task, label) not in self._results for label in task.method.labels)
+        ]
+
+    def run(self, tasks: Sequence[Task], progress: Progress) -> None:
+        """Run the tasks in turn. KeyboardInterrupt loses the task in hand and no other."""
+        for index, task in enumerate(tasks):
+
+            def part(
+                fraction: float, message: str, done: int = index, what: str = task.method.labels[-1]
+            ) -> None:
+                progress((done + fraction) / len(tasks), f"{what}: {message}")
+
+            part(0, task.bench_set.name)
+            with heeding_interrupts():
+                outcomes = task.method.run(task.repeat, part)
+            if task.repeat == 0:
+                for outcome in outcomes:
+                    write_image(self._image_path(task.bench_set, outcome.label), outcome.image)
+            self._results.add(self._measurement(task, outcome) for outcome in outcomes)
+
+    def median(self, bench_set: BenchSet, method: Method, label: str, repeats: int = 1) -> Measurement:
+        """Return the medians of a label's repeats."""
+        return self._results.medians(self._key(Task(bench_set, method), label), repeats)
+
+    def image(self, bench_set: BenchSet, label: str) -> FloatImage | None:
+        """Return the image of a label's first repeat, unless somebody has removed it."""
+        path = self._image_path(bench_set, label)
+        return read_image(path) if path.exists() else None
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file into the folder, whole or not at all."""
+        with replacing(self._folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def _key(self, task: Task, label: str) -> Key:
+        bench_set, settings = task.bench_set, task.method.settings
+        return Key(bench_set.name, label, settings, __version__, bench_set.digest, self._machine, task.repeat)
+
+    def _measurement(self, task: Task, outcome: Outcome) -> Measurement:
+        distances = asdict(compare(outcome.image, task.bench_set.reference))
+        return Measurement(
+            self._key(task, outcome.label),
+            outcome.seconds,
+            outcome.iterations,
+            **distances,
+            loss=outcome.loss,
+            psnr_noisy=outcome.psnr_noisy,
+        )
+
+    def _image_path(self, bench_set: BenchSet, label: str) -> Path:
+        name = re.sub(r"[^a-z0-9]+", "-", f"{bench_set.name} {label}".lower())
+        return self._folder / "images" / f"{name}.exr"
+
+
+@contextmanager
+def heeding_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the end if one came, for a fit ends early on it with what it has."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed = False
+
+    def note(number: int, frame: object) -> None:
+        nonlocal pressed
+        pressed = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
