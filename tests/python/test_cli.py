@@ -73,7 +73,7 @@ def fits(monkeypatch):
     """Replaces the fit by its mean colour; lists the settings that it was called with."""
     calls = []
 
-    def denoise(buffers, settings=None, progress=silent):
+    def denoise(buffers, settings=None, progress=silent, warm_start=None):
         settings = settings or FitSettings()
         calls.append(settings)
         os.write(1, b"a library that chatters on stdout\n")
@@ -410,7 +410,7 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     ]
     finished = tungsten_dip.fit.denoise
 
-    def interrupted(buffers, settings, progress):
+    def interrupted(buffers, settings, progress, warm_start):
         if fits:
             raise KeyboardInterrupt
         return finished(buffers, settings, progress)
@@ -486,7 +486,7 @@ def test_a_render_by_mitsuba_and_a_fit(tmp_path):
 
 
 def test_an_internal_error_is_one_line_and_a_traceback_only_on_demand(folder, tmp_path, monkeypatch, capfd):
-    def broken(buffers, settings, progress):
+    def broken(buffers, settings, progress, warm_start):
         raise RuntimeError("a bug\nin two lines")
 
     monkeypatch.setattr("tungsten_dip.fit.denoise", broken, raising=False)

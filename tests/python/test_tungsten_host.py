@@ -310,7 +310,7 @@ def test_checkpoints_are_previewed_and_a_failing_preview_does_not_stop_the_rende
 
 @in_process
 def test_the_command_denoises_and_previews_beside_the_renders_own_files(write_scene, tmp_path, monkeypatch):
-    def fit(buffers, settings):
+    def fit(buffers, settings, warm_start=None):
         asked.append((settings.preset, buffers.spp))
         return FitResult(color=buffers.color.mean, settings=settings, seconds=0.0, iterations=0)
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_type_hints
 
 from tungsten_dip.buffers import RenderBuffers, replacing
 from tungsten_dip.cli.console import duration, progress_on_stderr
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
 from tungsten_dip.report.page import report_page
 
@@ -26,20 +29,51 @@ def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
     add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=duration, help="end after 90s, 5m, ...")
     add(f"{flag}target-error", dest="target_error", metavar="E", type=float, help="end at this relMSE")
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")
+    add(f"{flag}save-model", dest="save_model", metavar="M.onnx", type=Path, help="save the fitted network")
+    add(f"{flag}warm-start", dest="warm_start", metavar="M.onnx", type=Path, help="start from this network")
 
 
-def fit_settings(options: argparse.Namespace, names: Sequence[str]) -> FitSettings:
-    """Return the settings with those of the named options that were given."""
+def fit_settings(
+    options: argparse.Namespace, names: Sequence[str], warm_start: Model | None = None
+) -> FitSettings:
+    """Return the settings (a model's, to start from it) with those of the named options that were given."""
+    settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     given = {name: getattr(options, name) for name in names}
-    return FitSettings(**{name: value for name, value in given.items() if value is not None})
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
-def denoise_with_progress(buffers: RenderBuffers, settings: FitSettings) -> FitResult:
+def load_warm_start(options: argparse.Namespace) -> Model | None:
+    """Return the model that the fit is to start from, if any."""
+    if options.warm_start is None:
+        return None
+    from tungsten_dip.onnx import load_model  # imports ONNX
+
+    return load_model(options.warm_start)
+
+
+def denoise_with_progress(
+    buffers: RenderBuffers, settings: FitSettings, warm_start: Model | None = None
+) -> FitResult:
     """Denoise the buffers and show progress on stderr."""
     from tungsten_dip.fit import denoise  # imports torch
 
     with progress_on_stderr("denoising") as progress:
-        return denoise(buffers, settings, progress)
+        return denoise(buffers, settings, progress, warm_start=warm_start)
+
+
+def write_model(path: Path, result: FitResult) -> None:
+    """Save the fitted network.
+
+    Raises InputError if nothing was fitted, or the file cannot be written.
+    """
+    from tungsten_dip.onnx import save_model
+
+    if result.model is None:
+        raise InputError(
+            f"{path}: not written: no network was fitted, for want of independent halves A and B of the "
+            f"colour; render with two_buffer_variance"
+        )
+    save_model(path, result.model)
 
 
 def write_report(

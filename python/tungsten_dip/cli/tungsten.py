@@ -17,11 +17,14 @@ from tungsten_dip.cli.denoising import (
     add_fit_options,
     denoise_with_progress,
     fit_settings,
+    load_warm_start,
+    write_model,
     write_report,
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, require_torch
+from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.progress import Progress
 from tungsten_dip.report.preview import side_by_side
@@ -45,13 +48,15 @@ def denoise_outputs(
     settings: FitSettings,
     report: Path | None = None,
     remarks: Sequence[str] = (),
+    warm_start: Model | None = None,
+    save_model: Path | None = None,
 ) -> None:
     """Denoise a render and write the result beside its own files.
 
     Writes ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked for,
-    the report. ``remarks`` are lines on the render for the report.
+    the report and the fitted network. ``remarks`` are lines on the render for the report.
     """
-    result = denoise_with_progress(buffers, settings)
+    result = denoise_with_progress(buffers, settings, warm_start)
     exr, png, pair = _denoised_paths(outputs)
     noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))
     write_denoised(exr, result, buffers)
@@ -59,7 +64,9 @@ def denoise_outputs(
     write_image(pair, side_by_side(noisy, denoised))
     if report is not None:
         write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
-    for written in filter(None, (exr, png, pair, report)):
+    if save_model is not None:
+        write_model(save_model, result)
+    for written in filter(None, (exr, png, pair, report, save_model)):
         log.info("wrote %s", written)
 
 
@@ -71,12 +78,12 @@ def _run(arguments: Sequence[str] | None) -> None:
         parser.print_help()
         return
     if not options.dip_denoise:
-        for name in (*FIT_OPTIONS, "report", "dip_preview"):
+        for name in (*FIT_OPTIONS, "report", "save_model", "warm_start", "dip_preview"):
             if getattr(options, name) not in (None, False):
                 raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
     else:
         require_torch()
-    for name in ("output_file", "hdr_output_file", "report"):
+    for name in ("output_file", "hdr_output_file", "report", "save_model"):
         path, count = getattr(options, name), len(options.scenes)
         if path is not None and count > 1:
             raise InputError(f"{path}: one file for {count} scenes; render them one at a time")
@@ -94,11 +101,12 @@ def _run(arguments: Sequence[str] | None) -> None:
     if host == "tungsten" and not tungsten_host.in_process():
         tungsten_host.run_native(arguments)
 
-    settings = fit_settings(options, (*FIT_OPTIONS, "threads"))
+    warm_start = load_warm_start(options)
+    settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     failed = 0
     for path in options.scenes:
         try:
-            _render_scene(path, host, options, settings)
+            _render_scene(path, host, options, settings, warm_start)
         except InputError as error:
             if len(options.scenes) == 1:
                 raise
@@ -148,7 +156,13 @@ def _stock_arguments(arguments: Sequence[str]) -> list[str]:
     return stock
 
 
-def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: FitSettings) -> None:
+def _render_scene(
+    path: Path,
+    host: str,
+    options: argparse.Namespace,
+    settings: FitSettings,
+    warm_start: Model | None,
+) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files."""
     scene = load_scene(path, options.input_directory)
     if options.output_directory is not None:
@@ -167,6 +181,8 @@ def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: 
             check_writable(derived, (derived.suffix,))
     if options.report is not None:
         check_writable(options.report, (".html",))
+    if options.save_model is not None:
+        check_writable(options.save_model, (".onnx",))
 
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
@@ -184,7 +200,16 @@ def _render_scene(path: Path, host: str, options: argparse.Namespace, settings: 
         for written in filter(None, (outputs.ldr, outputs.hdr)):
             log.info("wrote %s", written)
         if options.dip_denoise:
-            denoise_outputs(buffers, outputs, scene.camera.tonemap, settings, options.report, remarks)
+            denoise_outputs(
+                buffers,
+                outputs,
+                scene.camera.tonemap,
+                settings,
+                options.report,
+                remarks,
+                warm_start,
+                options.save_model,
+            )
 
 
 def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten_host.Rendered], None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -20,17 +20,19 @@ from tungsten_dip.buffers import (
     write_image,
 )
 from tungsten_dip.cli.bench import add_bench
-from tungsten_dip.cli.console import Parser, json_on_stdout, remarks_from_log, run
+from tungsten_dip.cli.console import Parser, json_on_stdout, progress_on_stderr, remarks_from_log, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     REPORT_HELP,
     add_fit_options,
     denoise_with_progress,
     fit_settings,
+    load_warm_start,
+    write_model,
     write_report,
 )
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
 
@@ -64,14 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     denoise.set_defaults(action=_denoise)
     add = denoise.add_argument
     add("input", metavar="INPUT", type=Path, help=INPUT_HELP)
-    add(
-        "-o",
-        "--output",
-        metavar="OUT.exr",
-        type=Path,
-        required=True,
-        help="where to write the denoised image",
-    )
+    _add_output_options(denoise)
     add_fit_options(denoise, prefix="")
     add("--iterations", metavar="N", type=int, help="stop the fit after this many iterations")
     add("--seed", metavar="N", type=int, help="of the network's first weights and its input (default: 0)")
@@ -82,11 +77,16 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--inputs", choices=get_args(Inputs), help="(default: all+random)")
     paper.add_argument("--scheme", choices=get_args(types["scheme"]), help="(default: iic)")
     paper.add_argument("--channels", metavar="8,16,...", type=_counts, help="(default: 8,16,32,64,128)")
-    add = denoise.add_argument_group("files").add_argument
-    add("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[], help=MAP_HELP)
-    add("--half", action="store_true", help="write 16-bit floats")
-    add("--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel")
-    add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
+
+    infer = commands.add_parser("infer", help="denoise with a network that was saved, without torch")
+    infer.set_defaults(action=_infer)
+    add = infer.add_argument
+    add("model", metavar="M.onnx", type=Path, help="what denoise --save-model wrote")
+    add("input", metavar="INPUT", type=Path, help=INPUT_HELP)
+    _add_output_options(infer)
+    add("--refit", metavar="N", type=int, default=0, help="first train on this image, N steps at most")
+    add("--save-model", metavar="M.onnx", type=Path, help="save the network after --refit")
+    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
 
     inspect = commands.add_parser("inspect", help="show what a scene calls for, or what a file holds")
     inspect.set_defaults(action=_inspect)
@@ -99,29 +99,69 @@ def _parser() -> argparse.ArgumentParser:
 
     add_bench(commands)
 
-    for command in (denoise, inspect, compare):
+    for command in (denoise, infer, inspect, compare):
         command.add_argument(
             "--json", action="store_true", help="print one JSON object on stdout, nothing else"
         )
     return parser
 
 
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    """Add what becomes of a denoised image, and how its buffers are read."""
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.exr",
+        type=Path,
+        required=True,
+        help="where to write the denoised image",
+    )
+    add = parser.add_argument_group("files").add_argument
+    add("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[], help=MAP_HELP)
+    add("--half", action="store_true", help="write 16-bit floats")
+    add("--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel")
+    add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
+
+
 def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    warm_start = load_warm_start(options)
     fixed = [name for name in PAPER_SETTINGS if getattr(options, name) is not None]
-    if fixed and options.preset != "paper":
-        raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
     names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
-    settings = fit_settings(options, names)
-    for path, suffix in ((options.output, ".exr"), (options.error_map, ".exr"), (options.report, ".html")):
-        if path is not None:
-            check_writable(path, (suffix,))
+    settings = fit_settings(options, names, warm_start)
+    if fixed and settings.preset != "paper":
+        raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
+    return _denoised(options, lambda buffers: denoise_with_progress(buffers, settings, warm_start))
+
+
+def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    model = tungsten_dip.load_model(options.model)
+
+    def infer(buffers: RenderBuffers) -> FitResult:
+        with progress_on_stderr("denoising") as progress:
+            return tungsten_dip.infer(model, buffers, options.threads, progress, refit_steps=options.refit)
+
+    return _denoised(options, infer)
+
+
+def _denoised(
+    options: argparse.Namespace, denoise: Callable[[RenderBuffers], FitResult]
+) -> tuple[dict[str, Any], str]:
+    """Read the buffers, denoise them, write all that the options ask for."""
+    suffixes = {"output": ".exr", "error_map": ".exr", "report": ".html", "save_model": ".onnx"}
+    for name, suffix in suffixes.items():
+        if getattr(options, name) is not None:
+            check_writable(getattr(options, name), (suffix,))
     if options.error_map is not None and options.error_map.resolve() == options.output.resolve():
         raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, dict(options.map))
-        result = denoise_with_progress(buffers, settings)
+        result = denoise(buffers)
     write_denoised(options.output, result, buffers, half=options.half)
+    if options.report is not None:
+        write_report(options.report, options.input.name, buffers, result, TONEMAP, remarks)
+    if options.save_model is not None:
+        write_model(options.save_model, result)
     if options.error_map is not None:
         if result.error is None:
             raise InputError(
@@ -129,8 +169,6 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
                 "colour; render with two_buffer_variance"
             )
         write_image(options.error_map, result.error)
-    if options.report is not None:
-        write_report(options.report, options.input.name, buffers, result, TONEMAP, remarks)
 
     facts = {
         "output": str(options.output),

@@ -48,12 +48,13 @@ def denoise(
 
     With ``warm_start`` (of an earlier frame, say) the network starts from the model's weights, with its
     pilots and constants, and trains for as many steps as the error that the halves tell asks for, at most
-    ``settings.iterations``. Without settings, those of the model hold.
+    ``settings.iterations``. Without settings, those of the model hold, but for the iterations.
 
     Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is,
     candidates are of another shape or not finite, or the model does not fit the image or the settings.
     """
-    settings = settings or (FitSettings() if warm_start is None else warm_start.settings)
+    if settings is None:
+        settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     require_torch()

@@ -285,7 +285,7 @@ def _array(tensor: TensorProto | None, name: str, dtype: str) -> np.ndarray[Any,
     count = math.prod(tensor.dims) if all(0 < d <= _LARGEST_COUNT for d in tensor.dims) else -1
     if len(tensor.dims) > 4 or count * np.dtype(dtype).itemsize != len(tensor.raw_data):
         raise InputError(f"{name}: expected raw data of the shape that it names, found other data")
-    array = array_from_tensor(tensor)
+    array = array_from_tensor(tensor).copy()
     if not np.isfinite(array).all():
         raise InputError(f"{name}: expected finite weights, found NaN or Inf")
     return array

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +13,14 @@ import numpy.typing as npt
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
 
+_LOG = logging.getLogger(__name__)
+
 RELMSE_EPSILON = 0.01
 """Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""
 
 DISPLAY_GAMMA = 2.2
+
+_METRIC_BY_PACKAGE = {"skimage": "SSIM", "flip_evaluator": "FLIP"}
 
 SSIM_WINDOW = 7
 """Side in pixels of the window in which Wang et al. 2004 compare, as scikit-image has it."""
@@ -27,14 +33,15 @@ class Comparison:
     ``psnr`` (dB), ``ssim`` and ``flip`` are of the displayed images (clipped to [0, 1], gamma 2.2);
     ``relmse`` and ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None
     where a side is under 7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of
-    exposures. ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is
+    exposures. ``ssim``, ``flip`` and ``hdrflip`` are None too where the packages that compute them are not
+    installed. ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is
     the mean radiance over the reference's, None where that is black.
     """
 
     psnr: float
     relmse: float
     ssim: float | None
-    flip: float
+    flip: float | None
     hdrflip: float | None
     nonfinite: int
     mean_ratio: float | None
@@ -44,7 +51,8 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     """Compare two images of linear radiance, shape (height, width, 3).
 
     PSNR is 10 log10(1 / MSE); relMSE is mean((x - r)^2 / (r^2 + 0.01)) over pixels and channels; SSIM is
-    Wang et al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP theirs of 2021, at 67 pixels per degree.
+    Wang et al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP theirs of 2021, at 67 pixels per degree. SSIM
+    and FLIP need the extra ``compare`` of this package, and are logged as missing without it.
 
     Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference
     is not finite.
@@ -58,6 +66,10 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
         raise InputError(f"compare: expected an image with pixels, got one of shape {image.shape}")
     if not np.isfinite(reference).all():
         raise InputError("compare: expected a finite reference, got one with NaN or Inf; render it anew")
+
+    for package, metric in _METRIC_BY_PACKAGE.items():
+        if find_spec(package) is None:
+            _LOG.info("no %s: it needs %s; pip install 'tungsten-dip[compare]'", metric, package)
 
     finite = np.isfinite(image)
     x = np.where(finite, image, 0).astype(np.float32)
@@ -93,7 +105,7 @@ def _psnr(x: FloatImage, r: FloatImage) -> float:
 
 
 def _ssim(x: FloatImage, r: FloatImage) -> float | None:
-    if min(x.shape[:2]) < SSIM_WINDOW:
+    if min(x.shape[:2]) < SSIM_WINDOW or find_spec("skimage") is None:
         return None
     from skimage import metrics
 
@@ -109,7 +121,9 @@ def _hdrflip(x: FloatImage, r: FloatImage) -> float | None:
     return _flip(x, r, "HDR")
 
 
-def _flip(x: FloatImage, r: FloatImage, dynamic_range: str) -> float:
+def _flip(x: FloatImage, r: FloatImage, dynamic_range: str) -> float | None:
+    if find_spec("flip_evaluator") is None:
+        return None
     import flip_evaluator
 
     return float(flip_evaluator.evaluate(r, x, dynamic_range, applyMagma=False)[1])
