@@ -509,11 +509,26 @@ def test_a_command_leaves_logging_and_stdout_as_they_were(folder, tmp_path, fits
     assert capfd.readouterr().out == "still there"
 
 
-def test_a_missing_part_of_the_package_is_named(tmp_path, monkeypatch, capfd):
+def test_a_missing_part_of_the_package_is_named(folder, tmp_path, monkeypatch, capfd):
+    def fit(*_, **__):
+        raise ModuleNotFoundError("No module named 'drjit'", name="drjit")
+
+    monkeypatch.setattr("tungsten_dip.fit.denoise", fit)
+    arguments = ["denoise", str(folder), "-o", str(tmp_path / "out.exr")]
+    fails(capfd, command.main(arguments), "pip install 'tungsten-dip[mitsuba]'")
+
+
+def test_metrics_that_are_not_installed_are_named(tmp_path, monkeypatch, capfd):
     write_image(tmp_path / "image.exr", np.linspace(0, 1, 9 * 9 * 3, dtype=np.float32).reshape(9, 9, 3))
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    for package in ("flip_evaluator", "skimage"):
+        monkeypatch.setitem(sys.modules, package, None)
     image = str(tmp_path / "image.exr")
-    fails(capfd, command.main(["compare", image, image]), "pip install 'tungsten-dip[compare]'")
+    assert command.main(["compare", image, image, "--json"]) == 0
+    out, err = capfd.readouterr()
+    facts = json.loads(out)
+    assert facts["relmse"] == 0
+    assert facts["ssim"] is facts["flip"] is facts["hdrflip"] is None
+    assert err.count("pip install 'tungsten-dip[compare]'") == 2
 
 
 def test_a_reader_that_stops_early_is_no_error(scene):
