@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import checked_candidates
+from tungsten_dip.fit.evidence import checked_candidates, checked_previous
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
@@ -32,6 +32,7 @@ def denoise(
     progress: Progress = silent,
     candidates: Sequence[tuple[FloatImage, FloatImage]] = (),
     warm_start: Model | None = None,
+    previous: tuple[FloatImage, FloatImage] | None = None,
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 
@@ -46,6 +47,9 @@ def denoise(
     network chooses among them and its own. Without independent halves nothing can score them: they are not
     used.
 
+    ``previous`` is what the halves of the previous frame's result show of this frame, moved into place, NaN
+    where they show nothing. It is a candidate and a guide, beside which fewer pilots are needed.
+
     With ``warm_start`` (of an earlier frame, say) the network starts from the model's weights, with its
     pilots and constants, and trains for as many steps as the error that the halves tell asks for, at most
     ``settings.iterations``. Without settings, those of the model hold, but for the iterations.
@@ -59,9 +63,10 @@ def denoise(
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     require_torch()
     given = checked_candidates(buffers, candidates)
+    previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, settings.threads)
     if settings.preset == "paper":
-        if given:
+        if given or previous is not None:
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
         from tungsten_dip.fit.paper import fit_paper
 
@@ -69,7 +74,7 @@ def denoise(
     else:
         from tungsten_dip.fit.fusion import fit_fusion
 
-        result = fit_fusion(buffers, settings, progress, given, warm_start)
+        result = fit_fusion(buffers, settings, progress, given, warm_start, previous)
     result = replace(result, notes=(*mended, *result.notes))
     for note in result.notes:
         _LOG.info(note)

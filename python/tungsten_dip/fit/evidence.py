@@ -23,7 +23,15 @@ from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
-from tungsten_dip.fit.pilots import Guidance, Pilot, first_pilots, guidance_from_buffers, pilot_images
+from tungsten_dip.fit.pilots import (
+    FOLLOWING_PILOTS,
+    Guidance,
+    Pilot,
+    first_pilots,
+    following_pilots,
+    guidance_from_buffers,
+    pilot_images,
+)
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
@@ -149,25 +157,37 @@ def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> 
 
     Raises InputError if one is not a pair of images of the colour's shape, or holds NaN or Inf.
     """
-    expected = buffers.color.mean.shape
     checked = []
     for index, pair in enumerate(candidates):
-        if len(pair) != 2:
-            raise InputError(f"candidate {index}: expected a pair of images, one per half, got {len(pair)}")
-        with np.errstate(over="ignore"):
-            images = [np.ascontiguousarray(image, np.float32) for image in pair]
-        for name, image in zip("AB", images, strict=True):
-            if image.shape != expected:
-                raise InputError(
-                    f"candidate {index}, half {name}: expected shape {expected} as the colour has it, "
-                    f"got {image.shape}"
-                )
+        checked.append(_checked_pair(f"candidate {index}", pair, buffers))
+        for name, image in zip("AB", checked[-1], strict=True):
             if not np.isfinite(image).all():
                 raise InputError(
                     f"candidate {index}, half {name}: expected finite radiance, found NaN or Inf"
                 )
-        checked.append((images[0], images[1]))
     return tuple(checked)
+
+
+def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves | None:
+    """Return the previous frame's halves as float32, NaN where they show nothing.
+
+    Raises InputError if they are not a pair of images of the colour's shape.
+    """
+    return None if previous is None else _checked_pair("previous", previous, buffers)
+
+
+def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
+    if len(pair) != 2:
+        raise InputError(f"{what}: expected a pair of images, one per half, got {len(pair)}")
+    expected = buffers.color.mean.shape
+    with np.errstate(over="ignore"):
+        images = [np.ascontiguousarray(image, np.float32) for image in pair]
+    for name, image in zip("AB", images, strict=True):
+        if image.shape != expected:
+            raise InputError(
+                f"{what}, half {name}: expected shape {expected} as the colour has it, got {image.shape}"
+            )
+    return images[0], images[1]
 
 
 def evidence_from_buffers(
@@ -177,12 +197,14 @@ def evidence_from_buffers(
     candidates: Sequence[Halves],
     started: float,
     progress: Progress,
+    previous: Halves | None = None,
 ) -> Evidence | FitResult:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
     ``pilots`` as a layout, of a network that exists, says all that it expects; all its pilots are computed.
-    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``started`` is a value
-    of time.perf_counter.
+    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``previous`` is one
+    more, NaN where it shows nothing, that guides the others as well. ``started`` is a value of
+    time.perf_counter.
 
     Where there are no independent halves to score pilots with, returns what one of them makes of the image.
 
@@ -200,7 +222,7 @@ def evidence_from_buffers(
     progress(0.05, "features")
     layout = pilots if isinstance(pilots, Layout) else None
     if layout is not None:
-        _check_fits(layout, guidance, candidates)
+        _check_fits(layout, guidance, len(candidates) + (previous is not None))
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
     test = halves_independent(buffers, settings.threads)
@@ -210,7 +232,7 @@ def evidence_from_buffers(
             image = color.mean.copy()
         else:
             notes.append(_why_no_halves(buffers, test))
-            if candidates:
+            if candidates or previous is not None:
                 notes.append("the candidates are not used: nothing can score them")
             guides, irradiances, noise = first_pilots((_scaled(color.mean, scale),), variance, guidance)
             (image,) = pilot_images(_ONLY_PILOT, irradiances, guides, noise, guidance)
@@ -226,24 +248,34 @@ def evidence_from_buffers(
         notes.append(fireflies)
         mean = np.float32(0.5) * (halves[0] + halves[1])
     images: list[Halves] = [halves]
-    guides, irradiances, noise = first_pilots(halves, variance, guidance)
+    computed: dict[Pilot, Halves] = {}
+    if previous is None:
+        guides, irradiances, noise = first_pilots(halves, variance, guidance)
+    else:
+        moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
+        guides, irradiances, noise, first, filled = following_pilots(halves, moved, guidance)
+        computed[FOLLOWING_PILOTS[0]] = first
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
         late = time.perf_counter() - started > 0.7 * (settings.time_budget_s or math.inf)
         if layout is None and index > 0 and late:
             break
-        image_a, image_b = pilot_images(pilot, irradiances, guides, noise, guidance)
-        images.append((image_a, image_b))
+        if pilot not in computed:
+            image_a, image_b = pilot_images(pilot, irradiances, guides, noise, guidance)
+            computed[pilot] = image_a, image_b
+        images.append(computed[pilot])
     described = described[: len(images) - 1]
     for image_a, image_b in candidates:
         images.append((np.maximum(_scaled(image_a, scale), 0), np.maximum(_scaled(image_b, scale), 0)))
+    if previous is not None:
+        images.append(filled)
 
     denominators = _denominators(images[len(described)])
     errors = [_errors(pilot, halves, denominators) for pilot in images]
     if layout is None:
         mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
         best = 1 + int(np.argmin(mean_errors))
-        layout = Layout(guidance.names, described, len(candidates), reference=best)
+        layout = Layout(guidance.names, described, len(images) - 1 - len(described), reference=best)
     noise_a, noise_b = (
         mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[layout.reference]
     )
@@ -399,17 +431,17 @@ def result_from_fused(
     )
 
 
-def _check_fits(layout: Layout, guidance: Guidance, candidates: Sequence[Halves]) -> None:
+def _check_fits(layout: Layout, guidance: Guidance, candidates: int) -> None:
     unknown = [n for n in layout.features if n not in guidance.names and n not in guidance.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
         )
-    if layout.candidates != len(candidates):
+    if layout.candidates != candidates:
         raise InputError(
             f"the model was fitted with {layout.candidates} candidates, this input comes with "
-            f"{len(candidates)}; give as many, or fit without the model"
+            f"{candidates}; give as many, or fit without the model"
         )
 
 

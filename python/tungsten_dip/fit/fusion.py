@@ -25,7 +25,7 @@ from tungsten_dip.fit.evidence import (
     standardisation_of,
 )
 from tungsten_dip.fit.model import Model, Weights, check_settings, source_sha256
-from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, Pilot
+from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, FOLLOWING_PILOTS, Pilot
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.training import (
     ADAM_BETAS,
@@ -61,14 +61,16 @@ def fit_fusion(
     progress: Progress = silent,
     candidates: Sequence[Halves] = (),
     warm_start: Model | None = None,
+    previous: Halves | None = None,
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
     started = time.perf_counter()
     preset = _PRESETS[settings.preset]
     if warm_start is not None:
         check_settings(warm_start, settings)
-    asked = preset.pilots if warm_start is None or warm_start.layout is None else warm_start.layout
-    evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress)
+    pilots = preset.pilots if previous is None else FOLLOWING_PILOTS
+    asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
+    evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):
         return evidence
     known = None if warm_start is None else warm_start.standardisation

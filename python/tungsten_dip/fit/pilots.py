@@ -39,6 +39,8 @@ _GUIDE_OFFSET = 0.05
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
+_Pair = tuple[FloatImage, FloatImage]
+
 _CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 
 _SAMPLES_OF_FIRST_WINDOW = 12
@@ -72,6 +74,9 @@ BALANCED_PILOTS = (
     Pilot(18, k=1.5, step=2, with_position=True),
 )
 FINAL_PILOTS = (*BALANCED_PILOTS, Pilot(2, k=1.0), Pilot(9, k=0.5), Pilot(9, k=1.0, with_position=True))
+
+FOLLOWING_PILOTS = (Pilot(2), Pilot(6, k=2.0))
+"""Enough beside what the previous frame shows. The first stands where that shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,29 @@ def first_pilots(
     )
     guides, noise = _guides(guides, irradiances, variance, guidance)
     return guides, irradiances, noise
+
+
+def following_pilots(
+    colors: _Pair, previous: _Pair, guidance: Guidance
+) -> tuple[_Pair, _Pair, FloatImage, _Pair, _Pair]:
+    """Return (guides, demodulated colours, guide variance) as `first_pilots`, at a part of its cost.
+
+    ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the
+    guide, filled by the first of `FOLLOWING_PILOTS`; both come with it: (..., first pilot, filled previous).
+    """
+    irradiance_a, irradiance_b = (color / guidance.albedo for color in colors)
+    irradiances = irradiance_a, irradiance_b
+    first_a, first_b = (
+        np.maximum(_regress(image, FOLLOWING_PILOTS[0], guidance), 0) * guidance.albedo
+        for image in irradiances
+    )
+    filled_a, filled_b = (
+        np.where(np.isfinite(image), np.maximum(image, 0), first).astype(np.float32)
+        for image, first in zip(previous, (first_a, first_b), strict=True)
+    )
+    shown = tuple(image / guidance.albedo for image in (filled_a, filled_b))
+    (guide_a, guide_b), noise = _guides(shown, irradiances, None, guidance)
+    return (guide_a, guide_b), irradiances, noise, (first_a, first_b), (filled_a, filled_b)
 
 
 def pilot_images(

@@ -17,6 +17,7 @@ from tungsten_dip.fit.evidence import (
     Evidence,
     Halves,
     checked_candidates,
+    checked_previous,
     evidence_from_buffers,
     planes_of_half,
     result_from_fused,
@@ -42,13 +43,15 @@ def infer(
     progress: Progress = silent,
     candidates: Sequence[Halves] = (),
     refit_steps: int = 0,
+    previous: Halves | None = None,
 ) -> FitResult:
     """Denoise one image with a fitted network, by onnxruntime alone.
 
-    ``buffers`` and ``candidates`` are as in `tungsten_dip.denoise`; the features, and how many candidates,
-    are those of the fit. ``threads`` None uses every core. With ``refit_steps``, a pointwise network is first
-    trained further on this image, as by a warm start, for so many steps at most; the result's ``model`` is
-    then the refined one. A network of the preset paper gives the image by itself, and no error is known.
+    ``buffers``, ``candidates`` and ``previous`` are as in `tungsten_dip.denoise`; the features, and how many
+    candidates, are those of the fit. ``threads`` None uses every core. With ``refit_steps``, a pointwise
+    network is first trained further on this image, as by a warm start, for so many steps at most; the
+    result's ``model`` is then the refined one. A network of the preset paper gives the image by itself, and
+    no error is known.
 
     Raises InputError if the image is empty, the model does not fit it, or refit_steps cannot be done.
     """
@@ -59,11 +62,12 @@ def infer(
     # A FitSettings checks the threads as well.
     settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
     given = checked_candidates(buffers, candidates)
+    previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, threads)
     if model.layout is not None:
-        result = _infer_fusion(model, buffers, settings, given, refit_steps, progress)
+        result = _infer_fusion(model, buffers, settings, given, previous, refit_steps, progress)
     else:
-        if refit_steps or given:
+        if refit_steps or given or previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
         result = _infer_paper(model, buffers, settings, progress)
     result = replace(result, notes=(*mended, *result.notes))
@@ -77,12 +81,13 @@ def _infer_fusion(
     buffers: RenderBuffers,
     settings: FitSettings,
     candidates: Sequence[Halves],
+    previous: Halves | None,
     refit_steps: int,
     progress: Progress,
 ) -> FitResult:
     started = time.perf_counter()
     assert model.layout is not None
-    evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress)
+    evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):
         return evidence
     training = Training()
