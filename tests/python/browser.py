@@ -47,6 +47,7 @@ def assert_page_works(path: Path) -> None:
     """Assert that a page with a comparison complains about nothing, fits a phone, and its divider moves."""
     with open_page(path) as page:
         divider = page.locator(".divider input").first
+        divider.scroll_into_view_if_needed()
         box = divider.bounding_box()
 
         def at() -> float:
@@ -69,14 +70,15 @@ def assert_page_works(path: Path) -> None:
 
         left = page.locator(".compare select").first
         before = page.locator(".picture.left img").first.get_attribute("alt")
-        left.select_option(index=1)
+        left.select_option(index=left.locator("option").count() - 1)
         assert page.locator(".picture.left img").first.get_attribute("alt") != before
         broken = "[...document.images].filter(image => !image.complete || !image.naturalWidth).length"
         assert page.evaluate(broken) == 0
     for dark in (False, True):
         with open_page(path, PHONE, dark) as page:
             assert page.evaluate("document.documentElement.scrollWidth") <= PHONE[0]
-            box = page.locator(".divider input").first.bounding_box()
+            divider = page.locator(".divider input").first
+            divider.scroll_into_view_if_needed()
+            box = divider.bounding_box()
             page.touchscreen.tap(box["x"] + box["width"] * 0.75, box["y"] + box["height"] / 2)
-            at = page.evaluate("document.querySelector('.divider input').value")
-            assert float(at) == pytest.approx(75, abs=3)
+            assert float(divider.input_value()) == pytest.approx(75, abs=3)

@@ -114,8 +114,8 @@ def times_text(times: IterationTimes, width: int, height: int, threads: int | No
     lines = [f"| {name} | {seconds * 1e3:.1f} | {times.ours_s / seconds:.2f} |" for name, seconds in rows]
     return "\n".join(
         [
-            f"Skip, all+random, {width} x {height}. Plain PyTorch is written from the description, it is not the "
-            "published code.",
+            f"Skip, all+random, {width} x {height}. Plain PyTorch is written from the method's description, "
+            "it is not the published code.",
             "",
             "| | ms per iteration | ours over it |",
             "|---|--:|--:|",

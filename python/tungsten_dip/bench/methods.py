@@ -24,6 +24,8 @@ _LOG = logging.getLogger(__name__)
 KINDS = ("presets", "budgets", "paper", "oidn", "nfor", "samples")
 """What `Plan.kinds` chooses from."""
 
+OUR_PRESETS: tuple[Preset, ...] = ("draft", "balanced", "final")
+
 OURS, IN_TIME, PAPER, OIDN, NFOR, SAMPLES = SERIES = (
     "our presets",
     "ours, in a given time",
@@ -75,7 +77,7 @@ class Plan:
     """
 
     kinds: tuple[str, ...] = KINDS
-    presets: tuple[Preset, ...] = ("draft", "balanced", "final")
+    presets: tuple[Preset, ...] = OUR_PRESETS
     budgets_s: tuple[float, ...] = (2, 5, 10, 20)
     paper_iterations: int = 3000
     nfor_s: float | None = None
@@ -89,6 +91,9 @@ class Plan:
         unknown = [kind for kind in self.kinds if kind not in KINDS]
         if unknown:
             raise InputError(f"methods: expected some of {', '.join(KINDS)}, got {unknown[0]}")
+        for preset in self.presets:
+            if preset not in OUR_PRESETS:
+                raise InputError(f"presets: expected some of {', '.join(OUR_PRESETS)}, got {preset}")
         for name in ("repeats", "paper_iterations", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -153,8 +153,7 @@ def run_paper_table(
             for index in sorted({0, best, len(medians) - 1})
         ]
         shown = [(label, image) for label, image in images if image is not None]
-        for suffix in ("svg", "png"):
-            write_iterations_plot(folder / f"iterations.{suffix}", bench_set, medians, shown)
+        write_iterations_plot(folder, bench_set, medians, shown)
     return text
 
 
@@ -200,8 +199,7 @@ def _markdown(
     found: Sequence[tuple[PublishedRow, Measurement]],
     threads: int | None,
 ) -> str:
-    header = [f"{name}, {scene}" if name.startswith("published") else name for name in COLUMNS]
-    lines = ["| " + " | ".join(header) + " |", "|--:|---|---|---|---" + "|--:" * 7 + "|"]
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|--:|---|---|---|---" + "|--:" * 7 + "|"]
     for row, ours in found:
         cells = (
             str(row.number),
@@ -226,8 +224,9 @@ def _markdown(
             "",
             *lines,
             "",
-            "Loss and PSNR to noisy are of the last iteration's output, PSNR to truth is of the average of all. "
-            "The truth of the published figures is an NFOR-denoised image, ours is the set's reference.",
+            "Loss and PSNR to noisy are of the last iteration's output, PSNR to truth is of the average of "
+            f"all. The published figures are those of {scene}; the truth there is an NFOR-denoised image, "
+            "here it is the set's reference.",
             "",
             f"Measured with: {machine}.",
             "",

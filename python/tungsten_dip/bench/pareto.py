@@ -59,8 +59,7 @@ def run_pareto(
     how = f"Figures are {repeats_text(plan.repeats)}. In bold: no faster method has a lower relMSE.\n"
     machine = "\n".join(f"- {name}: {value}" for name, value in facts)
     runner.write_text("table.md", "\n".join([*tables, how, machine, ""]))
-    for suffix in ("svg", "png"):
-        write_pareto_plot(folder / f"plot.{suffix}", found)
+    write_pareto_plot(folder, found)
     runner.write_text("page.html", pareto_page(found, facts, plan.repeats))
     return found
 

@@ -67,8 +67,8 @@ def require_matplotlib() -> None:
         raise InputError("plots need matplotlib; install it with: pip install 'tungsten-dip[bench]'")
 
 
-def write_pareto_plot(path: Path, found: Sequence[SetRows]) -> None:
-    """Write one row of plots for every set, as .svg or .png."""
+def write_pareto_plot(folder: Path, found: Sequence[SetRows]) -> None:
+    """Write one row of plots for every set as ``plot.svg`` and ``plot.png``."""
     with _figure(4.2 * len(METRICS), 3.6 * len(found) + 0.5) as figure:
         grid = figure.subplots(len(found), len(METRICS), squeeze=False)
         drawn = []
@@ -79,7 +79,7 @@ def write_pareto_plot(path: Path, found: Sequence[SetRows]) -> None:
         handles, names = _handles(grid[0][0])
         figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False)
         _write_marks(figure, drawn)
-        save(figure, path)
+        _save(figure, folder / "plot")
 
 
 def pareto_svgs(each: SetRows) -> Iterator[tuple[str, str]]:
@@ -101,11 +101,11 @@ def legend_html(rows: Sequence[Row]) -> str:
     return f'<p class="legend">{" ".join(items)}</p>'
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure whole or not at all, the same bytes for the same figure."""
-    with replacing(path) as temporary:
-        metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-        figure.savefig(temporary, facecolor="white", metadata=metadata)
+def _save(figure: Figure, path: Path) -> None:
+    """Write a figure as .svg and .png, each whole or not at all, the same bytes for the same figure."""
+    for suffix, metadata in ((".svg", {"Date": None}), (".png", {"Software": None})):
+        with replacing(path.with_suffix(suffix)) as temporary:
+            figure.savefig(temporary, facecolor="white", metadata=metadata)
 
 
 @contextmanager
@@ -118,7 +118,7 @@ def _figure(width: float, height: float) -> Iterator[Figure]:
         yield Figure(figsize=(width, height), layout="constrained", dpi=144)
 
 
-def style(axes: Axes, colors: Colors) -> None:
+def _style(axes: Axes, colors: Colors) -> None:
     """Take from axes all that carries nothing."""
     axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
     axes.patch.set_visible(False)
@@ -141,7 +141,7 @@ def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, color
     """Draw one metric of every row over seconds, and return what is to be written beside the points."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    style(axes, colors)
+    _style(axes, colors)
     axes.set_xscale("log")
     axes.set_yscale("log" if logarithmic else "linear")
     axes.set_xlabel("seconds", color=colors.soft, labelpad=1)
@@ -186,6 +186,7 @@ def _end_at_noisy(axes: Axes, rows: Sequence[Row], metric: str) -> None:
 def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) -> None:
     """Write the marks beside their points, each where the least is in the way."""
     figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     point = figure.dpi / 72
     for axes, marks in drawn:
         box = axes.get_window_extent()
@@ -235,18 +236,21 @@ def _for_page(figure: Figure, title: str) -> str:
 
 
 def write_iterations_plot(
-    path: Path,
+    folder: Path,
     bench_set: BenchSet,
     medians: Sequence[Measurement],
     images: Sequence[tuple[str, FloatImage]],
 ) -> None:
-    """Write what iterations do to the published method's image: its PSNR as they go, and some images."""
+    """Write what iterations do to the published method's image: its PSNR as they go, and some images.
+
+    The files are ``iterations.svg`` and ``iterations.png``.
+    """
     shown = [("noisy", bench_set.buffers.color.mean), *images, ("reference", bench_set.reference)]
     height, width = bench_set.reference.shape[:2]
     with _figure(10, 3.2 + 10 / len(shown) * height / width) as figure:
         grid = figure.add_gridspec(2, len(shown), height_ratios=(2.7, 10 / len(shown) * height / width))
         axes = figure.add_subplot(grid[0, :])
-        style(axes, PRINTED)
+        _style(axes, PRINTED)
         axes.set_xscale("log")
         counts = [median.iterations for median in medians]
         for name, label, color in (("psnr_noisy", "to noisy", 1), ("psnr", "to reference", 0)):
@@ -260,4 +264,4 @@ def write_iterations_plot(
             below.imshow(display_from_radiance(image, "gamma"), interpolation="antialiased")
             below.set_axis_off()
             below.set_title(label, fontsize=9, color=PRINTED.ink)
-        save(figure, path)
+        _save(figure, folder / "iterations")

@@ -44,7 +44,7 @@ class Measurement:
     psnr: float
     relmse: float
     ssim: float | None
-    flip: float
+    flip: float | None
     hdrflip: float | None
     nonfinite: int
     mean_ratio: float | None
