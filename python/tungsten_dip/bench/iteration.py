@@ -61,11 +61,14 @@ def time_iterations(
 
     Every repeat runs ``iterations`` of each in turn.
 
-    Raises InputError if a side is no multiple of 32 (which would have plain PyTorch crop the image), or a
-    number is below 1.
+    Raises InputError if a side is no multiple of 32 (the published method crops to one) or below 64 (its
+    coarsest scale would be one pixel, which cannot be normalised), or a number is below 1.
     """
-    if width < 1 or height < 1 or width % MULTIPLE or height % MULTIPLE:
-        raise InputError(f"size: expected multiples of {MULTIPLE} such as 512x288, got {width}x{height}")
+    if min(width, height) < 2 * MULTIPLE or width % MULTIPLE or height % MULTIPLE:
+        raise InputError(
+            f"size: expected multiples of {MULTIPLE} from {2 * MULTIPLE} on such as 512x288, "
+            f"got {width}x{height}"
+        )
     for name, value in (("iterations", iterations), ("repeats", repeats)):
         if value < 1:
             raise InputError(f"{name}: expected a number above 0, got {value}")

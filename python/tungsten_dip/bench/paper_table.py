@@ -36,6 +36,9 @@ SCENES = ("cornell-box", "car2", "lamp")
 TOO_MANY = 10 / 3
 """How far beyond the iterations of the table the figure goes: the published one shows 10000 beside 3000."""
 
+TOO_FEW = 30
+"""The first image of the figure comes after the iterations of the table over this."""
+
 COLUMNS = (
     "row",
     "network",
@@ -147,10 +150,11 @@ def run_paper_table(
     runner.write_text("paper.csv", _csv(found))
     if figure:
         medians = [runner.median(bench_set, curve, label) for label in curve.labels]
+        few = next(index for index, m in enumerate(medians) if (m.iterations or 0) * TOO_FEW >= iterations)
         best = int(np.argmax([median.psnr for median in medians]))
         images = [
             (f"{medians[index].iterations} iterations", runner.image(bench_set, curve.labels[index]))
-            for index in sorted({0, best, len(medians) - 1})
+            for index in sorted({few, best, len(medians) - 1})
         ]
         shown = [(label, image) for label, image in images if image is not None]
         write_iterations_plot(folder, bench_set, medians, shown)

@@ -245,6 +245,8 @@ def write_iterations_plot(
 
     The files are ``iterations.svg`` and ``iterations.png``.
     """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
     shown = [("noisy", bench_set.buffers.color.mean), *images, ("reference", bench_set.reference)]
     height, width = bench_set.reference.shape[:2]
     with _figure(10, 3.2 + 10 / len(shown) * height / width) as figure:
@@ -257,6 +259,8 @@ def write_iterations_plot(
             values = [getattr(median, name) for median in medians]
             axes.plot(counts, values, "o-", ms=4, lw=1.2, color=PRINTED.series[color], label=label)
         axes.set_xlabel("iterations", color=PRINTED.soft)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_title(f"{bench_set.name}: PSNR in dB", fontsize=9, loc="left", color=PRINTED.ink)
         axes.legend(frameon=False)
         for column, (label, image) in enumerate(shown):
