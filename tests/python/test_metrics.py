@@ -93,3 +93,65 @@ def test_relative_squared_error_keeps_the_shape():
 def test_display_clips_and_applies_the_gamma():
     image = np.array([[[-1.0, 0.5, 7.0]]], dtype=np.float32)
     np.testing.assert_allclose(display_from_linear(image), [[[0, 0.5 ** (1 / 2.2), 1]]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("color", "reference"),
+    [
+        ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)),
+        ((0.2, 0.5, 0.1), (0.25, 0.45, 0.1)),
+        ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        ((0.9, 0.1, 0.3), (0.1, 0.4, 0.6)),
+    ],
+)
+def test_flip_of_uniform_images_is_the_published_colour_difference(color, reference):
+    # Filters leave uniform images as they are, and there are no edges or points in them.
+    images = [np.full((40, 40, 3), each, dtype=np.float32) for each in (color, reference)]
+    displayed = [display_from_linear(image)[0, 0].astype(np.float64) for image in images]
+    assert compare(*images).flip == pytest.approx(flip_of_colors(*displayed), abs=2e-3)
+
+
+def flip_of_colors(displayed, displayed_reference):
+    """Andersson et al., "FLIP: A Difference Evaluator for Alternating Images" (HPG 2020), section 4.1."""
+
+    def hunt_lab(srgb):
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        to_xyz = np.array(
+            [
+                [0.4124564, 0.3575761, 0.1804375],
+                [0.2126729, 0.7151522, 0.0721750],
+                [0.0193339, 0.1191920, 0.9503041],
+            ]
+        )
+        ratio = to_xyz @ linear / to_xyz.sum(axis=1)
+        f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+        lightness = 116 * f[1] - 16
+        # The Hunt effect: colours look less saturated where it is dark.
+        return np.array(
+            [lightness, *(np.array([500 * (f[0] - f[1]), 200 * (f[1] - f[2])]) * 0.01 * lightness)]
+        )
+
+    def hyab(a, b):
+        return abs(a[0] - b[0]) + np.hypot(*(a - b)[1:])
+
+    power, corner, level = 0.7, 0.4, 0.95
+    largest = hyab(hunt_lab(np.array([0.0, 1.0, 0.0])), hunt_lab(np.array([0.0, 0.0, 1.0]))) ** power
+    difference = hyab(hunt_lab(displayed), hunt_lab(displayed_reference)) ** power
+    if difference < corner * largest:
+        return level / (corner * largest) * difference
+    return level + (difference - corner * largest) / ((1 - corner) * largest) * (1 - level)
+
+
+def test_hdr_flip_sees_what_the_display_clips(gradient):
+    reference = 20 * gradient
+    brighter = np.where(reference > 1, 2 * reference, reference)
+    result = compare(brighter, reference)
+    assert result.flip == pytest.approx(0, abs=1e-6)
+    assert result.hdrflip > 0.05
+
+
+def test_ssim_of_uniform_images_compares_their_levels_alone():
+    low, high = 0.2, 0.5
+    images = [np.full((16, 16, 3), level**2.2, dtype=np.float32) for level in (low, high)]
+    c1 = 0.01**2
+    assert compare(*images).ssim == pytest.approx((2 * low * high + c1) / (low**2 + high**2 + c1), rel=1e-4)
