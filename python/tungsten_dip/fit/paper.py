@@ -2,13 +2,7 @@
 
 Souri & Zakeri, "Deep Learning Based Denoiser for Images Rendered by Monte Carlo Sampling": a network is
 fitted to one noisy LDR image by mean squared error, and the running average of its outputs is the denoised
-image. This differs from the published code where that code
-
-- crops the image to a multiple of 32: here it is padded, and the output cropped back;
-- reads PNGs: here the images are not rounded to 8 bits, and channels of one value are left out;
-- mirrors the edge of every 3x3 convolution: here those of the fine scales' way up repeat it (`networks`);
-- draws the input noise of every iteration anew: here it is a random window of a pool of Gaussian noise;
-- averages the output that made it backtrack and takes a step from it: here that iteration only goes back.
+image. ``docs/method.md`` states it whole, and where this differs from the published code and why.
 """
 
 from __future__ import annotations
