@@ -72,6 +72,11 @@ def assert_page_works(path: Path) -> None:
         before = page.locator(".picture.left img").first.get_attribute("alt")
         left.select_option(index=left.locator("option").count() - 1)
         assert page.locator(".picture.left img").first.get_attribute("alt") != before
+        views = page.locator(".compare").first.get_by_label("View").locator("option")
+        if views.count() > 1:
+            page.get_by_label("View").first.select_option(index=1)
+            scale = "new DOMMatrix(getComputedStyle(document.querySelector('.picture.left img')).transform).a"
+            assert page.evaluate(scale) > 1
         broken = "[...document.images].filter(image => !image.complete || !image.naturalWidth).length"
         assert page.evaluate(broken) == 0
     for dark in (False, True):

@@ -152,9 +152,9 @@ def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, color
         for row, value in known:
             if row.median.seconds is None:
                 axes.axhline(value, color=color, linewidth=1, linestyle="--", label=series)
-        timed = sorted(
+        timed = [
             (row.median.seconds, value, row.mark) for row, value in known if row.median.seconds is not None
-        )
+        ]
         if timed:
             seconds, values, _ = zip(*timed, strict=True)
             line = "-" if series in _JOINED else ""
@@ -162,12 +162,10 @@ def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, color
             marks += [_Mark(mark, second, value, color) for second, value, mark in timed]
     axes.margins(x=0.12, y=0.12)
     _end_at_noisy(axes, rows, metric)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    if logarithmic:
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+    for axis in (axes.xaxis, axes.yaxis) if logarithmic else (axes.xaxis,):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
     return marks
 
 
