@@ -252,7 +252,7 @@ def write_iterations_plot(
         axes = figure.add_subplot(grid[0, :])
         _style(axes, PRINTED)
         axes.set_xscale("log")
-        counts = [median.iterations for median in medians]
+        counts = [median.iterations or 0 for median in medians]
         for name, label, color in (("psnr_noisy", "to noisy", 1), ("psnr", "to reference", 0)):
             values = [getattr(median, name) for median in medians]
             axes.plot(counts, values, "o-", ms=4, lw=1.2, color=PRINTED.series[color], label=label)
