@@ -54,6 +54,19 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
 
 
+def input_files(path: str | Path, mapping: Mapping[str, str] | None = None) -> list[Path]:
+    """Return the files that `read_buffers` reads, whose change is a change of the input.
+
+    Raises InputError if a folder or a scene does not name them.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return list(_files_of_folder(path, dict(mapping or {})).values())
+    if path.suffix.lower() == ".json":
+        return [path, *_files_of_scene(path).values()]
+    return [path]
+
+
 def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path]:
     try:
         present = sorted(file for file in folder.iterdir() if file.suffix.lower() in RADIANCE_SUFFIXES)

@@ -83,3 +83,14 @@ def write_report(
     page = report_page(title, buffers, result, tonemap, remarks)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
+
+
+def name_and_channel(text: str) -> tuple[str, str]:
+    """Return the two sides of a --map, NAME=CHANNEL.
+
+    Raises argparse.ArgumentTypeError if the text is anything else.
+    """
+    name, separator, channel = text.partition("=")
+    if not (name and separator and channel):
+        raise argparse.ArgumentTypeError(f"expected NAME=CHANNEL such as color=beauty, got '{text}'")
+    return name, channel

@@ -28,9 +28,11 @@ from tungsten_dip.cli.denoising import (
     denoise_with_progress,
     fit_settings,
     load_warm_start,
+    name_and_channel,
     write_model,
     write_report,
 )
+from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs
 
@@ -97,9 +99,10 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("image", metavar="IMAGE", type=Path)
     compare.add_argument("reference", metavar="REFERENCE", type=Path)
 
+    sequence = add_sequence(commands)
     add_bench(commands)
 
-    for command in (denoise, infer, inspect, compare):
+    for command in (denoise, infer, inspect, compare, sequence):
         command.add_argument(
             "--json", action="store_true", help="print one JSON object on stdout, nothing else"
         )
@@ -117,7 +120,7 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         help="where to write the denoised image",
     )
     add = parser.add_argument_group("files").add_argument
-    add("--map", metavar="NAME=CHANNEL", type=_pair, action="append", default=[], help=MAP_HELP)
+    add("--map", metavar="NAME=CHANNEL", type=name_and_channel, action="append", default=[], help=MAP_HELP)
     add("--half", action="store_true", help="write 16-bit floats")
     add("--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel")
     add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
@@ -227,10 +230,3 @@ def _counts(text: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected counts such as 8,16,32,64,128, got '{text}'") from None
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, separator, channel = text.partition("=")
-    if not (name and separator and channel):
-        raise argparse.ArgumentTypeError(f"expected NAME=CHANNEL such as color=beauty, got '{text}'")
-    return name, channel

@@ -1,0 +1,145 @@
+"""The command ``tungsten-dip sequence``: denoise an animation's frames, here or on a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tungsten_dip.buffers import check_writable, replacing
+from tungsten_dip.cli.console import progress_on_stderr
+from tungsten_dip.cli.denoising import (
+    FIT_OPTIONS,
+    add_fit_options,
+    fit_settings,
+    load_warm_start,
+    name_and_channel,
+)
+from tungsten_dip.errors import InputError
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
+
+    from tungsten_dip.sequence.following import Models
+    from tungsten_dip.sequence.work import Record
+
+log = logging.getLogger(__name__)
+
+TONEMAP = "gamma"
+"""How the page shows frames: Tungsten's default."""
+
+
+def add_sequence(commands: _SubParsersAction[Any]) -> argparse.ArgumentParser:
+    """Add ``sequence``; return its parser."""
+    sequence: argparse.ArgumentParser = commands.add_parser(
+        "sequence", help="denoise the frames of an animation, each from the one before"
+    )
+    sequence.set_defaults(action=_sequence)
+    add = sequence.add_argument
+    add("input", metavar="'IN/f####'", help="inputs as for denoise; ####, %%04d or * stands for the number")
+    add("-o", "--output", metavar="'OUT/f####.exr'", required=True, help="where the results go")
+    add("--frames", metavar="1-100,103", help="which frames (default: all that are there)")
+    add("--cameras", metavar="'f####.json'", help="the scenes of the frames: lets one frame help the next")
+    add("--refit", metavar="auto|N|0", type=_refit, default="auto", help=_REFIT_HELP)
+    add("--scheduler", metavar="local|tcp://...", default="local", help="a Dask scheduler that runs already")
+    add("--workers", metavar="N", type=int, default=1, help="how many local processes (default: 1)")
+    add_fit_options(sequence, prefix="")
+    add("--threads", metavar="N", type=int, help="how many cores a frame uses (default: all there are)")
+    add(
+        "--map",
+        metavar="NAME=CHANNEL",
+        type=name_and_channel,
+        action="append",
+        default=[],
+        help="as for denoise",
+    )
+    add("--half", action="store_true", help="write 16-bit floats")
+    add("--report", metavar="R.html", type=Path, help="write a page with the frames, their time and error")
+    return sequence
+
+
+_REFIT_HELP = (
+    "how many steps a frame's network is trained further: what its error asks for (auto, the default), at "
+    "most N, or 0 for inference alone"
+)
+
+
+def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from tungsten_dip.sequence.cluster import denoise_on_cluster
+    from tungsten_dip.sequence.following import Models
+    from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+    from tungsten_dip.sequence.work import Run, denoise_frames
+
+    if options.workers < 1:
+        raise InputError(f"--workers: expected 1 or more, got {options.workers}")
+    if options.scheduler != "local" and "://" not in options.scheduler:
+        raise InputError(
+            f"--scheduler {options.scheduler}: expected local or an address such as tcp://host:8786"
+        )
+    numbers = None if options.frames is None else numbers_from_text(options.frames)
+    frames = find_frames(options.input, options.output, numbers, options.cameras)
+    frames[0].output.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(frames[0].output)
+    if options.report is not None:
+        check_writable(options.report, (".html",))
+    warm_start = load_warm_start(options)
+    settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
+    run = Run(settings, options.refit, dict(options.map), options.half)
+    models = Models(first=warm_start)
+
+    with progress_on_stderr("denoising") as progress:
+        if options.scheduler == "local" and options.workers == 1:
+            records, models = denoise_frames(frames, run, models, progress, _tell)
+        else:
+            records, models = denoise_on_cluster(
+                frames, run, options.scheduler, options.workers, models, progress, _tell
+            )
+    if options.report is not None:
+        _write_report(options.report, options.input, records)
+    if options.save_model is not None:
+        _save_model(options.save_model, models)
+    failures = [record for record in records if record.error is not None]
+    if failures:
+        numbers_of = ", ".join(str(record.number) for record in failures)
+        raise InputError(
+            f"{len(failures)} of {len(records)} frames have no result: {numbers_of}; the others are done"
+        )
+    seconds = sum(record.seconds for record in records)
+    facts = {"frames": [asdict(record) for record in records]}
+    return facts, f"{len(records)} frames, denoised in {seconds:.1f} s in all"
+
+
+def _tell(record: Record) -> None:
+    if record.error is None:
+        log.info(
+            "frame %d: %s, %d steps, %.1f s: %s",
+            record.number, record.how, record.iterations, record.seconds, record.output,
+        )  # fmt: skip
+
+
+def _save_model(path: Path, models: Models) -> None:
+    """Save the network of the first frame, which other sequences may start from."""
+    from tungsten_dip.onnx import save_model
+
+    if models.first is None:
+        raise InputError(f"{path}: not written: no frame was fitted, all were finished or had no halves")
+    save_model(path, models.first)
+
+
+def _write_report(path: Path, title: str, records: Sequence[Record]) -> None:
+    from tungsten_dip.sequence.page import sequence_page
+
+    page = sequence_page(title, records, TONEMAP)
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _refit(text: str) -> int | str:
+    if text == "auto":
+        return text
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"expected auto, 0 or a number of steps, got '{text}'")
+    return int(text)

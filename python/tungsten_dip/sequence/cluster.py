@@ -1,0 +1,135 @@
+"""Frames on many processes or machines: Dask schedules them, workers read and write the files themselves.
+
+One task fits the first frames, whose networks all others share. Frames that follow one another are one task,
+so that what one shows helps the next. A worker that dies loses the frame in hand: its task is done again
+elsewhere and skips what is finished.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.progress import Progress, silent
+from tungsten_dip.sequence.following import Models
+from tungsten_dip.sequence.frames import Frame
+from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
+
+_LOG = logging.getLogger(__name__)
+
+_LONGEST_TASK = 24
+"""Frames; a task that is done again has to look at all of them."""
+
+_CONNECT_TIMEOUT_S = 30
+
+
+def denoise_on_cluster(
+    frames: Sequence[Frame],
+    run: Run,
+    scheduler: str = "local",
+    workers: int = 1,
+    models: Models | None = None,
+    progress: Progress = silent,
+    tell: Callable[[Record], None] = lambda _: None,
+) -> tuple[list[Record], Models]:
+    """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes.
+
+    Paths mean the same to all workers (a shared file system). Without ``run.settings.threads``, local workers
+    share the cores, and others use one core each. Returns the records of all frames, in their order, and the
+    networks that they shared.
+
+    Raises InputError if Dask is not installed or the scheduler does not answer.
+    """
+    frames = [_absolute(frame) for frame in frames]
+    to_do, records = split_finished(frames, run)
+    for record in records:
+        tell(record)
+    if run.settings.threads is None:
+        share = max(1, (os.cpu_count() or 1) // workers) if scheduler == "local" else 1
+        run = replace(run, settings=replace(run.settings, threads=share))
+    shared = models or Models()
+    if to_do:
+        with _client(scheduler, workers) as client:
+            for done, found in _done(client, to_do, run, models):
+                shared = found or shared
+                for record in done:
+                    records.append(record)
+                    tell(record)
+                    progress(len(records) / len(frames), f"frame {record.number}")
+    return sorted(records, key=lambda record: record.number), shared
+
+
+def _done(
+    client: Any, frames: list[Frame], run: Run, models: Models | None
+) -> Iterator[tuple[list[Record], Models | None]]:
+    """Yield records as they come, the first frames' with their networks."""
+    from distributed import as_completed
+
+    # A frame with a camera also fits the network for frames that follow.
+    lead = frames[: 2 if frames[0].scene is not None else 1]
+    rest = frames[len(lead) :]
+    first = client.submit(denoise_frames, lead, run, models, key=_key(lead), pure=False)
+    tasks = {first: lead}
+    shared = client.submit(itemgetter(1), first, pure=False)
+    count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    # Frames that do not help one another are tasks of their own: none waits for a slow one.
+    length = min(_LONGEST_TASK, -(-len(rest) // count)) if frames[0].scene is not None else 1
+    for start in range(0, len(rest), max(length, 1)):
+        part = rest[start : start + length]
+        tasks[client.submit(denoise_frames, part, run, shared, key=_key(part), pure=False)] = part
+    for task in as_completed(tasks):
+        if task.status == "finished":
+            records, found = task.result()
+            yield records, found if task is first else None
+        else:
+            yield [failed(frame, task.exception()) for frame in tasks[task]], None
+
+
+@contextmanager
+def _client(scheduler: str, workers: int) -> Iterator[Any]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise InputError(
+            "several workers need dask; install it with: pip install 'tungsten-dip[cluster]'"
+        ) from error
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    if scheduler == "local":
+        with (
+            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{scheduler}: no scheduler answers ({error}); start one with: dask scheduler"
+        ) from error
+    with client:
+        client.wait_for_workers(1)
+        yield client
+
+
+def _absolute(frame: Frame) -> Frame:
+    def absolute(path: Path) -> Path:
+        return path if path.is_absolute() else Path.cwd() / path
+
+    return Frame(
+        frame.number,
+        absolute(frame.input),
+        absolute(frame.output),
+        None if frame.scene is None else absolute(frame.scene),
+    )
+
+
+def _key(frames: Sequence[Frame]) -> str:
+    return f"frames {frames[0].number}-{frames[-1].number} {os.urandom(4).hex()}"

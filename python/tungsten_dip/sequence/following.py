@@ -1,0 +1,177 @@
+"""One frame after another: the first is fitted, the others start from its network and from the frame before.
+
+Where the cameras are known, what the previous frame's result shows of the next is moved into place and guides
+it (`reprojection`): then few pilots are enough, a network of its own chooses among them, and noise averages
+out over the frames. Otherwise a frame has the first one's pilots, and starts from its network. A cut is told
+by the features (little of the previous frame is in sight) or by the error, and fitted anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit import denoise
+from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.onnx.inference import infer
+from tungsten_dip.progress import Progress, silent
+from tungsten_dip.scene.types import Camera
+from tungsten_dip.sequence.flicker import estimated_flicker
+from tungsten_dip.sequence.reprojection import Halves, check_camera, reproject
+
+_LOG = logging.getLogger(__name__)
+
+Refit = int | Literal["auto"]
+How = Literal["fitted", "followed", "cut"]
+
+_FIRST_FOLLOWING_STEPS = 60
+"""Of the network for frames that follow: it has few pilots, and its task is close to the next frame's."""
+
+_MOST_STEPS = 240
+_LEAST_IN_SIGHT = 0.3
+"""Part of the picture that the previous frame must show of this one; below, it is another scene."""
+
+_CUT_ERROR = 3.0
+"""How many times the previous frame's error tells of a cut."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """The networks that frames start from: the first one's, and that of frames whose predecessor is known."""
+
+    first: Model | None = None
+    following: Model | None = None
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A frame's result, how it came about and how it flickers against the one before (None: not known)."""
+
+    result: FitResult
+    how: How
+    flicker: float | None = None
+
+
+@dataclass(frozen=True)
+class _Last:
+    """What is kept of a frame for the next one."""
+
+    buffers: RenderBuffers
+    camera: Camera | None
+    result: FitResult
+
+
+class Follower:
+    """Denoises frames in their order. ``models`` are the networks so far."""
+
+    def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models | None = None) -> None:
+        """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
+
+        Raises InputError if the settings are those of the published method, which has no halves to follow.
+        """
+        if settings.preset == "paper":
+            raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
+        self.models = models or Models()
+        self._settings = settings
+        self._refit = refit
+        self._last: _Last | None = None
+        self._error: float | None = None
+
+    def denoise(
+        self, buffers: RenderBuffers, camera: Camera | None = None, progress: Progress = silent
+    ) -> Followed:
+        """Denoise the next frame.
+
+        Raises InputError as `tungsten_dip.denoise` does, or if the camera took another picture.
+        """
+        if camera is not None:
+            check_camera(camera, buffers)
+        buffers, mended = sanitize(buffers, self._settings.threads)
+        for note in mended:
+            _LOG.info(note)
+        how: How = "fitted"
+        try:
+            followed = self._follow(buffers, camera, progress)
+        except _CutError as cut:
+            _LOG.info("a cut: %s", cut)
+            how, followed = "cut", None
+        if followed is None:
+            followed = Followed(denoise(buffers, self._settings, progress), how)
+            self.models = replace(self.models, first=followed.result.model)
+        result = followed.result
+        self._error = _typical_error(result)
+        self._last = _Last(buffers, camera, result)
+        return replace(followed, result=replace(result, notes=(*mended, *result.notes)))
+
+    def _follow(self, buffers: RenderBuffers, camera: Camera | None, progress: Progress) -> Followed | None:
+        """Return what follows from the networks and the last frame, None if there is neither.
+
+        Raises _CutError if the frame shows something else.
+        """
+        last = self._last
+        if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
+            raise _CutError("the previous frame had another size")
+        moved = None if last is None else _moved(last, buffers, camera)
+        if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
+            raise _CutError("the previous frame shows little of this one")
+        model = self.models.first if moved is None else self.models.following
+        if model is not None:
+            steps = _MOST_STEPS if self._refit == "auto" else self._refit
+            threads = self._settings.threads
+            try:
+                result = infer(model, buffers, threads, progress, refit_steps=steps, previous=moved)
+            except InputError as problem:
+                raise _CutError(str(problem)) from problem
+        elif moved is not None:
+            settings = replace(self._settings, iterations=_FIRST_FOLLOWING_STEPS)
+            result = denoise(buffers, settings, progress, previous=moved)
+        else:
+            return None
+        error = _typical_error(result)
+        if error is not None and self._error is not None and error > _CUT_ERROR * self._error:
+            raise _CutError(f"the error is {error / self._error:.1f} times that of the previous frame")
+        kept = result.model or model
+        if moved is None:
+            self.models = replace(self.models, first=kept)
+        else:
+            self.models = replace(self.models, following=kept)
+        return Followed(result, "followed", None if last is None else _flicker(last, buffers, result))
+
+
+class _CutError(Exception):
+    """A frame that does not go on with what the one before showed."""
+
+
+def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None) -> Halves | None:
+    """Return what the last frame shows of this one, None where that cannot be told."""
+    if camera is None or last.camera is None or last.result.halves is None:
+        return None
+    if buffers.depth is None or last.buffers.depth is None:
+        return None
+    return reproject(last.result.halves, last.buffers, last.camera, buffers, camera)
+
+
+def _typical_error(result: FitResult) -> float | None:
+    """Return the median error of the pixels that have any: no few outliers tell of a cut."""
+    if result.error is None:
+        return None
+    errors = result.error[result.error > 0]
+    return float(np.median(errors)) if errors.size else None
+
+
+def _flicker(last: _Last, buffers: RenderBuffers, result: FitResult) -> float | None:
+    color, before = buffers.color, last.buffers.color
+    if result.halves is None or last.result.halves is None:
+        return None
+    if color.half_a is None or color.half_b is None or before.half_a is None or before.half_b is None:
+        return None
+    return estimated_flicker(
+        result.halves, last.result.halves, (color.half_a, color.half_b), (before.half_a, before.half_b)
+    )

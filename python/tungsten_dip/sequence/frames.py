@@ -1,0 +1,114 @@
+"""Which files are frames: ``f####``, ``f%04d`` and ``f*``, and the numbers among them that are asked for."""
+
+from __future__ import annotations
+
+import glob
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from tungsten_dip.errors import InputError
+
+_NUMBER = re.compile(r"#+|%0?(\d*)d")
+_MOST_FRAMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame: its number, what it is read from and where its result goes, and the scene of its camera."""
+
+    number: int
+    input: Path
+    output: Path
+    scene: Path | None = None
+
+
+def numbers_from_text(text: str) -> tuple[int, ...]:
+    """Return the numbers of ``1-100`` or ``1-3,7,10-12``, in order, each once.
+
+    Raises InputError if the text is anything else.
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip())
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if first > last or last - first >= _MOST_FRAMES:
+            raise InputError(f"frames {text}: expected numbers such as 1-100 or 1-3,7; mend '{part}'")
+        numbers.update(range(first, last + 1))
+    return tuple(sorted(numbers))
+
+
+def find_frames(
+    inputs: str, outputs: str, numbers: tuple[int, ...] | None = None, scenes: str | None = None
+) -> list[Frame]:
+    """Return the frames in the order of their numbers.
+
+    ``inputs`` has a place for the number (``####``, ``%04d``) or is a glob pattern, whose files are numbered
+    by the last digits of their names. ``outputs`` has a place for the number, and so has ``scenes``, unless
+    the camera stands still. Of ``numbers``, every one is a frame, whether its files exist or not; None means
+    what is there.
+
+    Raises InputError if a pattern has no place for a number, nothing matches it, or two frames are the same.
+    """
+    if not _NUMBER.search(outputs):
+        raise InputError(f"{outputs}: expected a place for the frame's number, such as out/f####.exr")
+    if _NUMBER.search(inputs):
+        present = {number: Path(_named(inputs, number)) for number in numbers or ()}
+        if numbers is None:
+            present = _numbered(inputs)
+    else:
+        present = _globbed(inputs)
+        if numbers is not None:
+            missing = Path(inputs)
+            present = {number: present.get(number, missing) for number in numbers}
+    if not present:
+        raise InputError(f"{inputs}: no such frames; check the pattern (quoted, so that the shell keeps it)")
+    frames = []
+    for number, path in sorted(present.items()):
+        scene = None if scenes is None else Path(_named(scenes, number))
+        frames.append(Frame(number, path, Path(_named(outputs, number)), scene))
+    if len(frames) > 1 and frames[0].output == frames[1].output:
+        raise InputError(f"{outputs}: expected another name for every frame")
+    return frames
+
+
+def _named(pattern: str, number: int) -> str:
+    return _NUMBER.sub(lambda match: f"{number:0{_digits(match)}d}", pattern)
+
+
+def _digits(match: re.Match[str]) -> int:
+    return int(match[1] or 1) if match[0].startswith("%") else len(match[0])
+
+
+def _numbered(pattern: str) -> dict[int, Path]:
+    """Return the existing files whose name is the pattern's for some number."""
+    pattern = str(Path(pattern))
+    digits = re.compile(_NUMBER.sub(r"(\\d+)", re.sub(r"([^\w#%/])", r"\\\1", pattern)))
+    found = {}
+    for path in _glob(_NUMBER.sub("*", glob.escape(pattern))):
+        match = digits.fullmatch(str(path))
+        if match and _named(pattern, number := int(match[1])) == str(path):
+            found[number] = path
+    return found
+
+
+def _globbed(pattern: str) -> dict[int, Path]:
+    if not glob.has_magic(pattern):
+        raise InputError(
+            f"{pattern}: expected a place for the frame's number, such as f####, f%04d or f*; or use denoise"
+        )
+    found: dict[int, Path] = {}
+    for path in _glob(pattern):
+        digits = re.findall(r"\d+", path.stem if path.is_file() else path.name)
+        if not digits:
+            raise InputError(f"{path}: expected a frame's number in its name; use a narrower pattern")
+        number = int(digits[-1])
+        if number in found:
+            raise InputError(f"{found[number]} and {path}: both are frame {number}; use a narrower pattern")
+        found[number] = path
+    return found
+
+
+def _glob(pattern: str) -> list[Path]:
+    path = Path(pattern)
+    return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))

@@ -1,0 +1,123 @@
+"""The page of a sequence: its frames as a strip, and how time, error and flicker went along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from tungsten_dip.buffers.image_file import read_image
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.report import parts
+from tungsten_dip.report.parts import Picture
+from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.sequence.work import Record
+
+_MOST_PICTURES = 24
+_PICTURE_WIDTH = 320
+_WIDTH, _HEIGHT = 720, 180
+_LEFT, _RIGHT, _TOP, _BOTTOM = 90, 24, 12, 40
+"""Size of a plot and its margins in the units of the SVG."""
+
+_FLICKER_NOTE = (
+    "Relative squared error of the change from one frame to the next, at the same pixel, estimated without a "
+    "reference from the two halves of the samples. Where their noise leaves no better estimate, it is the "
+    "variance of the change: what the results of both halves have in common is then not in it."
+)
+
+
+def sequence_page(title: str, records: Sequence[Record], tonemap: str) -> str:
+    """Return the page, in HTML that needs no network.
+
+    Pictures are read from the records' outputs: all, or as many evenly spaced ones as a page can hold.
+    """
+    done = [record for record in records if record.error is None]
+    body = [
+        parts.figures(_figures(records)),
+        parts.gallery(_strip(done, tonemap), "crops"),
+        "<h2>Time</h2>",
+        _plot(done, "seconds", lambda record: record.seconds),
+        "<h2>Estimated relMSE</h2>",
+        _plot(done, "relMSE", lambda record: record.estimated_relmse),
+        "<h2>Flicker</h2>",
+        f"<p>{_FLICKER_NOTE}</p>",
+        _plot(done, "flicker", lambda record: record.flicker),
+        "<h2>Frames</h2>",
+        parts.table(("frame", "", "seconds", "steps", "estimated relMSE", "flicker"), map(_row, records), 2),
+    ]
+    return parts.page(title, f"{len(records)} frames", body)
+
+
+def _figures(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
+    by_how = {
+        how: [record.seconds for record in records if record.how in kinds and record.error is None]
+        for how, kinds in (("fitted", ("fitted", "cut")), ("followed", ("followed",)))
+    }
+    for how, seconds in by_how.items():
+        if seconds:
+            yield f"{how}, median", f"{len(seconds)} in {np.median(seconds):.2f} s each"
+    flickers = [record.flicker for record in records if record.flicker is not None]
+    if flickers:
+        yield "flicker", f"{np.mean(flickers):.3g}"
+    failures = sum(record.error is not None for record in records)
+    if failures:
+        yield "without a result", str(failures)
+
+
+def _strip(done: Sequence[Record], tonemap: str) -> Iterator[Picture]:
+    chosen = np.unique(np.linspace(0, len(done) - 1, min(len(done), _MOST_PICTURES)).round().astype(int))
+    for record in (done[index] for index in chosen if done):
+        color = read_image(Path(record.output))
+        yield Picture(f"frame {record.number}", display_from_radiance(_smaller(color), tonemap))
+
+
+def _smaller(image: FloatImage) -> FloatImage:
+    """Return means over squares of pixels, so that the width is at most about that of a picture."""
+    factor = max(1, round(image.shape[1] / _PICTURE_WIDTH))
+    height, width = (max(1, n // factor) for n in image.shape[:2])
+    cut = image[: height * factor, : width * factor]
+    squares = cut.reshape(height, -1, width, cut.shape[1] // width, 3)
+    return np.ascontiguousarray(squares.mean(axis=(1, 3)), np.float32)
+
+
+def _row(record: Record) -> tuple[str, ...]:
+    if record.error is not None:
+        return (str(record.number), record.error, "", "", "", "")
+    known = (record.estimated_relmse, record.flicker)
+    relmse, flickers = ("" if value is None else f"{value:.3g}" for value in known)
+    return (str(record.number), record.how, f"{record.seconds:.2f}", str(record.iterations), relmse, flickers)
+
+
+def _plot(records: Sequence[Record], what: str, value_of: Callable[[Record], float | None]) -> str:
+    """Return an SVG of a value over the frames' numbers, from 0 up."""
+    points = [(record.number, value) for record in records if (value := value_of(record)) is not None]
+    if not points:
+        return "<p>Not known.</p>"
+    first, last = points[0][0], points[-1][0]
+    top = max(max(value for _, value in points), 1e-12)
+    right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+
+    def place(number: int, value: float) -> tuple[float, float]:
+        across = (number - first) / max(last - first, 1)
+        return _LEFT + across * (right - _LEFT), bottom - value / top * (bottom - _TOP)
+
+    lines = []
+    for share in (0.0, 0.5, 1.0):
+        _, y = place(first, share * top)
+        lines.append(f'<line class="gridline" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        label = f"{share * top:.3g}"
+        lines.append(f'<text x="{_LEFT - 8}" y="{y:.1f}" dy="4" text-anchor="end">{label}</text>')
+    for number, anchor in ((first, "start"), (last, "end"))[: 1 + (last > first)]:
+        x, _ = place(number, 0)
+        lines.append(f'<text x="{x:.1f}" y="{_HEIGHT - 12}" text-anchor="{anchor}">frame {number}</text>')
+    places = [place(*point) for point in points]
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+    lines.append(f'<polyline class="curve" points="{path}"/>')
+    for (number, value), (x, y) in zip(points, places, strict=True):
+        told = escape(f"frame {number}: {value:.3g}")
+        lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3"><title>{told}</title></circle>')
+    label = f"{what} of every frame"
+    svg = f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">'
+    return f"{svg}{''.join(lines)}</svg>"

@@ -1,0 +1,173 @@
+"""What the previous frame shows of this one: its result, moved to where the camera now sees the same points.
+
+A pixel's depth and the camera give the point that it shows; projected into the previous frame, the four
+pixels around it are asked for their colour, each only if it shows the same surface: as in Schied et al. 2017,
+"Spatiotemporal Variance-Guided Filtering", section 4.1. Exact for diffuse light in scenes that stand still.
+What moved, was hidden or lay outside fails the tests; what they miss (a moved shadow) the fit finds by the
+error that it makes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
+
+_DEPTH_TOLERANCE = 0.02
+"""Relative difference of distances up to which two pixels show one surface."""
+
+_NORMAL_TOLERANCE = 0.2
+_ALBEDO_TOLERANCE = 0.1
+"""Of the larger of 1 and the albedo (a light's is its radiance)."""
+
+_LEAST_WEIGHT = 0.25
+"""Of the four pixels around a point, in total; less is the rim of a surface."""
+
+_LEAST_ALBEDO = 0.01
+_BLACK_ALBEDO = 1e-3
+"""A colour that cannot come from the albedo is not divided by it; as the fit has it (`fit/pilots.py`)."""
+
+Array = npt.NDArray[np.float32]
+Halves = tuple[FloatImage, FloatImage]
+
+
+def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
+    """Raise InputError if frames cannot be moved with this camera, or it took another picture."""
+    if not isinstance(camera, PinholeCamera | ThinlensCamera):
+        raise InputError(
+            f"camera of type {camera.kind}: expected pinhole or thinlens; leave the cameras out, frames are "
+            f"then denoised without their predecessors"
+        )
+    width, height = camera.resolution
+    if width * buffers.height != height * buffers.width:
+        raise InputError(
+            f"the camera takes {width}x{height} pixels, the buffers have {buffers.width}x{buffers.height}; "
+            f"name the scene that they were rendered from"
+        )
+
+
+def reproject(
+    halves: Halves,
+    previous: RenderBuffers,
+    previous_camera: Camera,
+    current: RenderBuffers,
+    camera: Camera,
+) -> Halves:
+    """Move the previous frame's halves (linear radiance, shape (height, width, 3)) to the current frame.
+
+    Both buffers are sanitised, have one size and a depth. Where the previous frame does not show what the
+    current one does, the result is NaN.
+    """
+    assert current.depth is not None
+    shape = current.color.mean.shape
+    depth = current.depth.mean[:, :, 0]
+    column, row, distance = _seen_from(previous_camera, _points(camera, depth), depth > 0)
+    # Light is moved without the albedo, which the current frame knows more sharply.
+    albedo, previous_albedo = _divisor(current), _divisor(previous)
+    images = [(half / previous_albedo).reshape(-1, 3) for half in halves]
+    moved = [np.zeros((depth.size, 3), np.float32) for _ in halves]
+    total = np.zeros(depth.size, np.float32)
+    for index, weight in _neighbours(column, row, shape[0], shape[1]):
+        weight = weight * _same_surface(previous, index, current, distance)
+        total += weight
+        for sums, image in zip(moved, images, strict=True):
+            sums += weight[:, None] * image[index]
+    total[total < _LEAST_WEIGHT] = np.nan
+    moved_a, moved_b = ((sums / total[:, None]).reshape(shape) * albedo for sums in moved)
+    return moved_a, moved_b
+
+
+def _points(camera: Camera, depth: Array) -> tuple[Array, Array]:
+    """Return the camera's position, and the way from there to what every pixel shows (length 1 for sky)."""
+    height, width = depth.shape
+    frame = np.asarray(camera.world_from_local, np.float64)
+    # Tungsten's PinholeCamera::sampleDirection: x from -1 to 1 over the width, the plane at 1 / tan(fov / 2).
+    ray = np.empty((height, width, 3), np.float32)
+    ray[:, :, 0] = (np.arange(width) + _pixel_center(camera)) * 2 / width - 1
+    ray[:, :, 1] = (height / width - (np.arange(height) + _pixel_center(camera)) * 2 / width)[:, None]
+    ray[:, :, 2] = _plane_distance(camera)
+    ray /= np.sqrt(np.einsum("...i,...i", ray, ray))[:, :, None]
+    world = ray @ _rotation(camera).T.astype(np.float32)
+    return frame[:3, 3].astype(np.float32), world * np.where(depth > 0, depth, 1)[:, :, None]
+
+
+def _seen_from(camera: Camera, points: tuple[Array, Array], hit: npt.NDArray[np.bool_]) -> tuple[Array, ...]:
+    """Return where a camera sees points, in pixels (far outside if behind it), and how far from it they are.
+
+    Arrays are flat. The distance of the sky is 0.
+    """
+    origin, way = points
+    height, width = hit.shape
+    position = np.asarray(camera.world_from_local, np.float64)[:3, 3]
+    offset = (origin - position).astype(np.float32)
+    local = (way + hit[:, :, None] * offset).reshape(-1, 3) @ _rotation(camera).astype(np.float32)
+    x, y, z = local.T
+    before = z > 0
+    scale = np.where(before, _plane_distance(camera) / np.where(before, z, 1), np.nan) * np.float32(width / 2)
+    column = np.where(before, x * scale + width / 2 - _pixel_center(camera), -2 * width)
+    row = np.where(before, height / 2 - y * scale - _pixel_center(camera), -2 * height)
+    return column, row, np.where(hit.ravel(), np.sqrt(np.einsum("ij,ij->i", local, local)), 0)
+
+
+def _neighbours(
+    column: Array, row: Array, height: int, width: int
+) -> Iterator[tuple[npt.NDArray[np.intp], Array]]:
+    """Yield flat indices and bilinear weights of the four pixels around; the weight is 0 outside."""
+    left, top = np.floor(column), np.floor(row)
+    right_share, bottom_share = column - left, row - top
+    for down in (0, 1):
+        y = top + down
+        of_row = np.where((y >= 0) & (y < height), bottom_share if down else 1 - bottom_share, 0)
+        for across in (0, 1):
+            x = left + across
+            of_column = np.where((x >= 0) & (x < width), right_share if across else 1 - right_share, 0)
+            index = np.clip(y, 0, height - 1) * width + np.clip(x, 0, width - 1)
+            yield index.astype(np.intp), (of_row * of_column).astype(np.float32)
+
+
+def _same_surface(
+    previous: RenderBuffers, index: npt.NDArray[np.intp], current: RenderBuffers, distance: Array
+) -> npt.NDArray[np.bool_]:
+    assert previous.depth is not None
+    found = previous.depth.mean.ravel()[index]
+    same: npt.NDArray[np.bool_] = np.where(
+        distance > 0, np.abs(found - distance) <= _DEPTH_TOLERANCE * distance, found == 0
+    )
+    for name, tolerance in (("normal", _NORMAL_TOLERANCE), ("albedo", _ALBEDO_TOLERANCE)):
+        before, now = getattr(previous, name), getattr(current, name)
+        if before is None or now is None:
+            continue
+        values = now.mean.reshape(-1, 3)
+        difference = np.abs(before.mean.reshape(-1, 3)[index] - values).max(axis=1)
+        same &= difference <= tolerance * np.maximum(1, values.max(axis=1))
+    return same
+
+
+def _divisor(buffers: RenderBuffers) -> FloatImage | np.float32:
+    if buffers.albedo is None:
+        return np.float32(1)
+    albedo = buffers.albedo.mean
+    black = albedo.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
+    return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
+
+
+def _rotation(camera: Camera) -> npt.NDArray[np.float64]:
+    columns = np.asarray(camera.world_from_local, np.float64)[:3, :3]
+    # A scaled frame scales neither the picture nor the distances along its rays.
+    rotation: npt.NDArray[np.float64] = columns / np.linalg.norm(columns, axis=0)
+    return rotation
+
+
+def _plane_distance(camera: Camera) -> float:
+    assert isinstance(camera, PinholeCamera | ThinlensCamera)
+    return float(1 / np.tan(np.radians(camera.fov) / 2))
+
+
+def _pixel_center(camera: Camera) -> float:
+    # Tungsten's thin lens centres its filter on a pixel's corner (`scene.types.ThinlensCamera`).
+    return 0.0 if isinstance(camera, ThinlensCamera) else 0.5

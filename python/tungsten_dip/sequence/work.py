@@ -1,0 +1,174 @@
+"""The files of a run: frames are read, denoised in their order, and written whole, each when it is done.
+
+A frame's file says what it was made from and how. A run that comes later (after a kill, say) skips it, unless
+its input or the settings have changed since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import OpenEXR
+
+from tungsten_dip.buffers.read import input_files, read_buffers
+from tungsten_dip.buffers.source import OWN
+from tungsten_dip.buffers.write import write_denoised
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.progress import Progress, silent
+from tungsten_dip.scene.parse import load_scene
+from tungsten_dip.sequence.following import Follower, Models, Refit
+from tungsten_dip.sequence.frames import Frame
+
+_LOG = logging.getLogger(__name__)
+
+_RECORD = OWN + "frame"
+"""The attribute of a frame's file that holds its record."""
+
+_NOT_OF_THE_IMAGE = ("threads", "device")
+"""Settings that may differ between the runs of one sequence."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What holds for all frames of a run. ``half`` stores pictures as 16-bit floats."""
+
+    settings: FitSettings = field(default_factory=FitSettings)
+    refit: Refit = "auto"
+    mapping: dict[str, str] = field(default_factory=dict)
+    half: bool = False
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of a frame. ``how`` is as in `following.Followed`; ``error`` says why there is no result.
+
+    ``seconds`` is all that the frame took but for writing it.
+    """
+
+    number: int
+    output: str
+    how: str = ""
+    seconds: float = 0.0
+    iterations: int = 0
+    estimated_relmse: float | None = None
+    flicker: float | None = None
+    error: str | None = None
+
+
+def finished(frame: Frame, run: Run) -> Record | None:
+    """Return the record of a frame whose file is there and up to date, None if it is to be done.
+
+    Raises InputError if the input is missing.
+    """
+    key = _key(frame, run)
+    try:
+        stored = json.loads(OpenEXR.File(str(frame.output), header_only=True).parts[0].header[_RECORD])
+        if stored.pop("key") != key:
+            return None
+        return Record(**{**stored, "number": frame.number, "output": str(frame.output)})
+    except (AttributeError, IndexError, KeyError, OSError, RuntimeError, TypeError, ValueError):
+        return None
+
+
+def split_finished(frames: Iterable[Frame], run: Run) -> tuple[list[Frame], list[Record]]:
+    """Return the frames that are to be done, and the records of the others."""
+    to_do, records = [], []
+    for frame in frames:
+        try:
+            record = finished(frame, run)
+        except InputError as error:
+            record = failed(frame, error)
+        if record is None:
+            to_do.append(frame)
+        else:
+            records.append(record)
+    return to_do, records
+
+
+def denoise_frames(
+    frames: Iterable[Frame],
+    run: Run,
+    models: Models | None = None,
+    progress: Progress = silent,
+    tell: Callable[[Record], None] = lambda _: None,
+) -> tuple[list[Record], Models]:
+    """Denoise frames one after another; return their records and the networks in the end.
+
+    Frames that are finished are skipped; one that cannot be read or written has an error in its record, and
+    the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short is not saved.
+    """
+    follower = Follower(run.settings, run.refit, models)
+    frames = list(frames)
+    records = []
+    for index, frame in enumerate(frames):
+        try:
+            record = finished(frame, run) or _denoise(
+                frame, run, follower, _part(progress, index, len(frames), frame)
+            )
+        except (InputError, OSError) as error:
+            record = failed(frame, error)
+        records.append(record)
+        tell(record)
+    return records, follower.models
+
+
+def _denoise(frame: Frame, run: Run, follower: Follower, progress: Progress) -> Record:
+    started = time.perf_counter()
+    key = _key(frame, run)
+    buffers = read_buffers(frame.input, run.mapping)
+    camera = None if frame.scene is None else load_scene(frame.scene).camera
+    followed = follower.denoise(buffers, camera, progress)
+    result = followed.result
+    if any(note.startswith("interrupted") for note in result.notes):
+        # The fit has ended early, which is no reason for a sequence to go on with a worse frame.
+        raise KeyboardInterrupt
+    record = Record(
+        number=frame.number,
+        output=str(frame.output),
+        how=followed.how,
+        seconds=time.perf_counter() - started,
+        iterations=result.iterations,
+        estimated_relmse=result.estimated_relmse,
+        flicker=followed.flicker,
+    )
+    attributes = {**buffers.attributes, _RECORD: json.dumps({"key": key, **asdict(record)})}
+    frame.output.parent.mkdir(parents=True, exist_ok=True)
+    write_denoised(frame.output, result, replace(buffers, attributes=attributes), half=run.half)
+    return record
+
+
+def failed(frame: Frame, error: Exception) -> Record:
+    """Log why a frame has no result, and return its record."""
+    message = str(error)
+    _LOG.error("frame %d: %s", frame.number, message)
+    return Record(frame.number, str(frame.output), error=message)
+
+
+def _key(frame: Frame, run: Run) -> str:
+    """Return what tells whether a result is of this input and these settings.
+
+    Raises InputError if the input is missing.
+    """
+    files = input_files(frame.input, run.mapping)
+    if frame.scene is not None:
+        files.append(frame.scene)
+    try:
+        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    except OSError as error:
+        raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
+    settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
+    facts: list[Any] = [stats, settings, run.refit, run.mapping, run.half]
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _part(progress: Progress, index: int, count: int, frame: Frame) -> Progress:
+    return lambda fraction, message: progress(
+        (index + fraction) / count, f"frame {frame.number}{', ' + message if message else ''}"
+    )
