@@ -37,7 +37,7 @@ def machine_facts(threads: int | None = None) -> list[tuple[str, str]]:
 
 def machine_key(threads: int | None = None) -> str:
     """Return in a few words what must stay the same for two measurements to be of one kind."""
-    return f"{cpu_model()}, {threads or os.cpu_count()} threads"
+    return f"{cpu_model()} with {threads or os.cpu_count()} threads"
 
 
 def _version(package: str) -> str | None:

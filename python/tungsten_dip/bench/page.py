@@ -103,7 +103,9 @@ def _details(pictures: Sequence[FloatImage]) -> list[tuple[int, int]]:
 
 
 def _error_map(image: FloatImage, reference: FloatImage) -> FloatImage:
-    error: npt.NDArray[np.float64] = relative_squared_error(np.nan_to_num(image), reference).mean(axis=2)
+    """Return the relative squared error of blocks of pixels; values that are not finite count as black."""
+    finite = np.where(np.isfinite(image), image, np.float32(0))
+    error: npt.NDArray[np.float64] = relative_squared_error(finite, reference).mean(axis=2)
     block = max(error.shape[1] // MAP_WIDTH_PX, 1)
     height, width = (size // block * block for size in error.shape)
     if block > 1 and height > 0:

@@ -56,7 +56,7 @@ def run_pareto(
 
     facts = machine_facts(plan.threads)
     tables = [f"## {each.bench_set.name}\n\n{markdown_table(each)}\n" for each in found]
-    how = f"Figures are {repeats_text(plan.repeats)}. In bold: no faster method has a lower relMSE.\n"
+    how = f"Figures: {repeats_text(plan.repeats)}. In bold: no faster method has a lower relMSE.\n"
     machine = "\n".join(f"- {name}: {value}" for name, value in facts)
     runner.write_text("table.md", "\n".join([*tables, how, machine, ""]))
     write_pareto_plot(folder, found)

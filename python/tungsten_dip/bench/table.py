@@ -83,4 +83,4 @@ def seconds_text(seconds: float | None) -> str:
 
 def repeats_text(repeats: int) -> str:
     """Return how a figure came about."""
-    return "of one run" if repeats == 1 else f"medians of {repeats} interleaved runs"
+    return "one run each" if repeats == 1 else f"medians of {repeats} interleaved runs"

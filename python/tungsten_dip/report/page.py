@@ -105,7 +105,7 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
     # An estimate without bias may fall below zero where the error is tiny; a logarithm cannot show it.
     known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
     if len(known) < 2:
-        return "<p>The buffers hold no independent evidence, so the error was not estimated on the way.</p>"
+        return "<p>Nothing independent was there to judge by, so the error was not estimated on the way.</p>"
     seconds = [point.seconds for point, _ in known]
     levels = [math.log10(relmse) for _, relmse in known]
     bottom, top = math.floor(min(levels)), max(math.ceil(max(levels)), math.floor(min(levels)) + 1)
