@@ -1,7 +1,7 @@
 """The graphs of the networks: what `fit.fusion` and `fit.networks` compute, in plain operators.
 
 The height and width of the inputs are free. A batch holds images that know nothing of one another: the batch
-norms of the preset paper, which always use the statistics of the image in hand, are instance norms here.
+norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
 """
 
 from __future__ import annotations
@@ -154,8 +154,20 @@ class _Network(GraphBuilder):
 
     def norm(self, x: str, name: str, channels: int) -> str:
         """Normalise every image and channel by itself."""
-        scale, shift = (self.weight(f"{name}.{what}", (channels,)) for what in ("weight", "bias"))
-        return self.add("InstanceNormalization", x, scale, shift, epsilon=_NORM_EPSILON)
+        weight, shift = (
+            self.add("Unsqueeze", self.weight(f"{name}.{what}", (channels,)), self.integers(1, 2))
+            for what in ("weight", "bias")
+        )
+        offset = self.add("Sub", x, self.pixel_mean(x))
+        variance = self.pixel_mean(self.add("Mul", offset, offset))
+        std = self.add("Sqrt", self.add("Add", variance, self.number(_NORM_EPSILON)))
+        return self.add("Add", self.add("Mul", offset, self.add("Div", weight, std)), shift)
+
+    def pixel_mean(self, x: str) -> str:
+        """Return the mean over height and width."""
+        # Row by row: the operator InstanceNormalization sums millions of pixels in one go and loses digits.
+        rows = self.add("ReduceMean", x, self.integers(3))
+        return self.add("ReduceMean", rows, self.integers(2))
 
     def leaky(self, x: str) -> str:
         """Apply a leaky ReLU."""
