@@ -90,6 +90,9 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     run = Run(settings, options.refit, dict(options.map), options.half)
     models = Models(first=warm_start)
 
+    # What is the same for all frames is not told for each.
+    for name in ("buffers", "fit", "onnx"):
+        logging.getLogger(f"tungsten_dip.{name}").setLevel(logging.WARNING)
     with progress_on_stderr("denoising") as progress:
         if options.scheduler == "local" and options.workers == 1:
             records, models = denoise_frames(frames, run, models, progress, _tell)

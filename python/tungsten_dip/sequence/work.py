@@ -68,6 +68,8 @@ def finished(frame: Frame, run: Run) -> Record | None:
     Raises InputError if the input is missing.
     """
     key = _key(frame, run)
+    if not frame.output.is_file():  # of which OpenEXR would complain on stderr
+        return None
     try:
         stored = json.loads(OpenEXR.File(str(frame.output), header_only=True).parts[0].header[_RECORD])
         if stored.pop("key") != key:

@@ -1,0 +1,275 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from moving_camera import HEIGHT, WIDTH, true_frame
+from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera
+from tungsten_dip.sequence.flicker import estimated_flicker, flicker
+from tungsten_dip.sequence.following import Follower
+from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+from tungsten_dip.sequence.reprojection import check_camera, reproject
+
+DRAFT = FitSettings(preset="draft", threads=1)
+
+
+# --- Which files are frames ---
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"), [("7", (7,)), ("1-3", (1, 2, 3)), ("5,1-2,2", (1, 2, 5)), ("0 , 3-3", (0, 3))]
+)
+def test_numbers_are_read(text, numbers):
+    assert numbers_from_text(text) == numbers
+
+
+@pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-3", "1,,2", "1-999999999", "1.5"])
+def test_other_numbers_are_refused_in_one_line(text):
+    with pytest.raises(InputError, match=r"^frames .*expected numbers such as") as caught:
+        numbers_from_text(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def folders(tmp_path):
+    for name in ("f0001", "f0003", "f0010", "f2", "g0001", "f00012"):
+        (tmp_path / name).mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize("pattern", ["f####", "f%04d"])
+def test_a_pattern_finds_exactly_the_frames_of_its_width(folders, pattern):
+    frames = find_frames(f"{folders}/{pattern}", "out/f##.exr")
+    assert [frame.number for frame in frames] == [1, 3, 10]
+    assert [str(frame.output) for frame in frames] == ["out/f01.exr", "out/f03.exr", "out/f10.exr"]
+    assert frames[0].input == folders / "f0001"
+
+
+def test_a_relative_pattern_and_its_scenes(folders, monkeypatch):
+    monkeypatch.chdir(folders)
+    (frame,) = find_frames("./f#", "o%d.exr", scenes="s%03d.json")
+    assert (frame.number, frame.input, frame.output) == (2, Path("f2"), Path("o2.exr"))
+    assert frame.scene == Path("s002.json")
+
+
+def test_a_glob_is_numbered_by_the_last_digits(folders):
+    (folders / "shot2_f0007.exr").touch()
+    (folders / "shot2_f0005.exr").touch()
+    frames = find_frames(f"{folders}/shot2_*.exr", "f####.exr")
+    assert [frame.number for frame in frames] == [5, 7]
+    assert [f.input.name for f in find_frames(f"{folders}/s*", "f#.exr", (7,))] == ["shot2_f0007.exr"]
+
+
+def test_brackets_in_a_pattern_with_numbers_are_plain(tmp_path):
+    (tmp_path / "[a] 1").mkdir()
+    assert [frame.number for frame in find_frames(f"{tmp_path}/[a] #", "o#.exr")] == [1]
+
+
+def test_frames_asked_for_need_not_exist(folders):
+    frames = find_frames(f"{folders}/f####", "o####.exr", (1, 2))
+    assert [frame.input.exists() for frame in frames] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "match"),
+    [
+        ("f####", "out.exr", "place for the frame's number"),
+        ("f0001", "o####.exr", "place for the frame's number"),
+        ("nothing####", "o####.exr", "no such frames"),
+        ("no*", "o####.exr", "no such frames"),
+        ("?0001", "o####.exr", "both are frame 1"),
+    ],
+)
+def test_patterns_that_name_no_frames_are_refused(folders, inputs, outputs, match):
+    with pytest.raises(InputError, match=match):
+        find_frames(f"{folders}/{inputs}", outputs)
+
+
+# --- Moving the previous frame into place ---
+
+
+def test_what_is_moved_is_what_the_camera_sees(tmp_path):
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.5))
+    truth = before.reference, 2 * before.reference
+    moved_a, moved_b = reproject(truth, before.buffers, before.camera, now.buffers, now.camera)
+    seen = np.isfinite(moved_a[:, :, 0])
+    assert seen.mean() > 0.85
+    still = np.abs(before.reference - now.reference)[seen]
+    error = np.abs(moved_a - now.reference)[seen]
+    assert error.mean() < 0.1 * still.mean()
+    assert still.mean() > 0.02
+    # Each half comes from the same half alone.
+    np.testing.assert_allclose(moved_b[seen], 2 * moved_a[seen], rtol=1e-5)
+    np.testing.assert_array_equal(np.isnan(moved_a), np.isnan(moved_b))
+
+
+def test_a_camera_that_stands_still_moves_nothing(tmp_path):
+    frame = true_frame(tmp_path, 0.1, seed=0)
+    moved, _ = reproject(
+        (frame.reference, frame.reference), frame.buffers, frame.camera, frame.buffers, frame.camera
+    )
+    np.testing.assert_allclose(moved, frame.reference, rtol=1e-3)
+
+
+def test_the_sky_moves_with_its_direction(tmp_path):
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.1))
+    sky = now.buffers.depth.mean[:, :, 0] == 0
+    assert sky.any()
+    moved, _ = reproject(
+        (before.reference, before.reference), before.buffers, before.camera, now.buffers, now.camera
+    )
+    assert np.isfinite(moved[sky]).all(axis=1).mean() > 0.8
+    np.testing.assert_allclose(moved[sky & np.isfinite(moved[:, :, 0])], 0.2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("quantity", ["depth", "normal", "albedo"])
+def test_another_surface_is_rejected(tmp_path, quantity):
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    changed = getattr(frame.buffers, quantity).mean.copy()
+    changed[10:16, 20:30] = changed[10:16, 20:30] * np.float32(1.5) + np.float32(0.5)
+    buffers = frame.buffers.with_quantities(**{quantity: Buffer(changed)})
+    moved, _ = reproject(
+        (frame.reference, frame.reference), buffers, frame.camera, frame.buffers, frame.camera
+    )
+    assert np.isnan(moved[11:15, 21:29]).all()
+    assert np.isfinite(moved[:9]).all()
+
+
+def test_what_lies_behind_the_previous_camera_is_not_seen(tmp_path):
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    turned = np.asarray(frame.camera.world_from_local) @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    moved, _ = reproject(
+        (frame.reference, frame.reference),
+        frame.buffers,
+        replace(frame.camera, world_from_local=turned),
+        frame.buffers,
+        frame.camera,
+    )
+    assert np.isnan(moved).all()
+
+
+def test_a_camera_of_another_picture_is_refused(tmp_path):
+    buffers = true_frame(tmp_path, 0.0, seed=0).buffers
+    check_camera(PinholeCamera(resolution=(2 * WIDTH, 2 * HEIGHT)), buffers)
+    with pytest.raises(InputError, match="the camera takes 100x100 pixels"):
+        check_camera(PinholeCamera(resolution=(100, 100)), buffers)
+    with pytest.raises(InputError, match="expected pinhole or thinlens"):
+        check_camera(EquirectangularCamera(resolution=(WIDTH, HEIGHT)), buffers)
+
+
+# --- Flicker ---
+
+
+def test_flicker_is_what_the_truth_does_not_do():
+    rng = np.random.default_rng(0)
+    before, now, offset = (rng.random((7, 5, 3), np.float32) for _ in range(3))
+    assert flicker(now + offset, before + offset, now, before) == pytest.approx(0, abs=1e-12)
+    ones = np.ones((3, 4, 3), np.float32)
+    assert flicker(1.1 * ones, ones, ones, ones) == pytest.approx(0.01 / 1.01, rel=1e-4)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.02])
+def test_the_halves_tell_the_flicker(bias):
+    """A result with noise of its own half and an error that changes: the estimate meets the truth."""
+    rng = np.random.default_rng(1)
+    shape, noise = (300, 400, 3), 0.1
+    references = [0.5 + 0.3 * rng.random(shape), 0.5 + 0.3 * rng.random(shape)]
+    noisy = [[r + noise * rng.standard_normal(shape) for _ in "ab"] for r in references]
+    # A tenth of a half's noise is left in what is made of it, and a bias of alternating sign.
+    fused = [
+        [r + 0.1 * (half - r) + sign * bias for half in halves]
+        for r, halves, sign in zip(references, noisy, (-1, 1), strict=True)
+    ]
+    noisy, fused = ([tuple(np.float32(h) for h in halves) for halves in pair] for pair in (noisy, fused))
+    true = flicker(*(np.mean(halves, axis=0) for halves in fused[::-1]), *map(np.float32, references[::-1]))
+    known = 2 * (0.1 * noise) ** 2 / 2 + (2 * bias) ** 2
+    denominator = np.mean([np.mean(r**2) for r in references]) + 0.01
+    assert true == pytest.approx(known / denominator, rel=0.1)
+    estimate = estimated_flicker(fused[1], fused[0], noisy[1], noisy[0])
+    assert estimate == pytest.approx(true, rel=0.15)
+
+
+# --- One frame after another ---
+
+
+def relmse(image, reference):
+    return float(np.mean((image - reference) ** 2 / (reference**2 + 0.01)))
+
+
+def test_frames_follow_and_gain_from_it(tmp_path):
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(4)]
+    follower = Follower(DRAFT)
+    followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
+    assert [f.how for f in followed] == ["fitted", "followed", "followed", "followed"]
+    assert followed[0].flicker is None
+    assert all(f.flicker is not None and f.flicker > 0 for f in followed[1:])
+    cold = [Follower(DRAFT).denoise(frame.buffers).result.color for frame in frames]
+    results = [f.result.color for f in followed]
+    errors, cold_errors = (
+        [relmse(image, frame.reference) for image, frame in zip(images, frames, strict=True)]
+        for images in (results, cold)
+    )
+    assert errors[-1] < 0.8 * cold_errors[-1]
+    shown, shown_cold = (
+        flicker(images[3], images[2], frames[3].reference, frames[2].reference) for images in (results, cold)
+    )
+    assert shown < 0.8 * shown_cold
+
+
+@pytest.mark.parametrize("refit", [0, 3])
+def test_refit_bounds_the_steps(tmp_path, refit):
+    follower = Follower(DRAFT, refit)
+    followed = [
+        follower.denoise(frame.buffers, frame.camera)
+        for frame in (true_frame(tmp_path, 0.05 * n, seed=n) for n in range(3))
+    ]
+    assert [f.how for f in followed] == ["fitted", "followed", "followed"]
+    assert followed[2].result.iterations <= refit
+
+
+def test_frames_without_cameras_start_from_the_first_ones_network(tmp_path):
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    follower = Follower(DRAFT, 0)
+    first, second = (follower.denoise(frame.buffers) for frame in frames)
+    assert (first.how, second.how) == ("fitted", "followed")
+    assert second.result.iterations == 0
+    assert follower.models.following is None
+    assert relmse(second.result.color, frames[1].reference) < 0.3 * relmse(
+        frames[1].buffers.color.mean, frames[1].reference
+    )
+
+
+def test_a_cut_is_told_by_what_is_in_sight(tmp_path):
+    follower = Follower(DRAFT)
+    before = true_frame(tmp_path, 0.0, seed=0)
+    follower.denoise(before.buffers, before.camera)
+    now = true_frame(tmp_path, 30.0, seed=1)
+    assert follower.denoise(now.buffers, now.camera).how == "cut"
+
+
+def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path, make_render):
+    follower = Follower(DRAFT, 0)
+    follower.denoise(make_render(spp=4096).buffers)
+    assert follower.denoise(make_render(spp=2, seed=1).buffers).how == "cut"
+    assert follower.denoise(make_render(20, 30).buffers).how == "cut"
+
+
+def test_frames_without_halves_are_denoised_each_by_itself(tmp_path):
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    plain = RenderBuffers(Buffer(frame.buffers.color.mean), depth=frame.buffers.depth)
+    follower = Follower(DRAFT)
+    for _ in range(2):
+        followed = follower.denoise(plain, frame.camera)
+        assert (followed.how, followed.flicker) == ("fitted", None)
+        assert np.isfinite(followed.result.color).all()
+
+
+def test_the_published_method_is_refused():
+    with pytest.raises(InputError, match="preset paper"):
+        Follower(FitSettings(preset="paper"))
