@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 OPSET = 18
 IR_VERSION = 8
@@ -83,8 +83,3 @@ class GraphBuilder:
         )
         helper.set_model_props(proto, metadata)
         return proto
-
-
-def array_from_tensor(tensor: onnx.TensorProto) -> npt.NDArray[Any]:
-    """Return what an initializer holds."""
-    return numpy_helper.to_array(tensor)

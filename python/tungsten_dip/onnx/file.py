@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
-from onnx import TensorProto
+from onnx import TensorProto, numpy_helper
 
 from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError
@@ -27,7 +27,6 @@ from tungsten_dip.fit.evidence import Layout, Standardisation
 from tungsten_dip.fit.model import Kind, Model
 from tungsten_dip.fit.pilots import Pilot
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.onnx.builder import array_from_tensor
 from tungsten_dip.onnx.graph import graph_of
 
 LARGEST_FILE_BYTES = 64 << 20
@@ -285,7 +284,7 @@ def _array(tensor: TensorProto | None, name: str, dtype: str) -> np.ndarray[Any,
     count = math.prod(tensor.dims) if all(0 < d <= _LARGEST_COUNT for d in tensor.dims) else -1
     if len(tensor.dims) > 4 or count * np.dtype(dtype).itemsize != len(tensor.raw_data):
         raise InputError(f"{name}: expected raw data of the shape that it names, found other data")
-    array = array_from_tensor(tensor).copy()
+    array = numpy_helper.to_array(tensor).copy()
     if not np.isfinite(array).all():
         raise InputError(f"{name}: expected finite weights, found NaN or Inf")
     return array
