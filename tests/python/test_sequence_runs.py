@@ -1,0 +1,249 @@
+"""Runs over files: what is skipped and what is done again, kills, breakage, the page, several processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from moving_camera import write_frames
+from tungsten_dip.buffers import read_buffers, read_image
+from tungsten_dip.cli.tungsten_dip import main
+from tungsten_dip.sequence import work
+
+COUNT = 4
+PROGRAM = [
+    sys.executable,
+    "-c",
+    "import sys; from tungsten_dip.cli.tungsten_dip import main; sys.exit(main())",
+]
+
+
+@pytest.fixture
+def frames(tmp_path, monkeypatch):
+    write_frames(tmp_path, COUNT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def arguments(*more: str) -> list[str]:
+    return [
+        *("sequence", "noisy/f####", "-o", "out/f####.exr", "--cameras", "cameras/f####.json"),
+        *("--preset", "draft", "--threads", "1", *more),
+    ]
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "out").glob("f*.exr"))}
+
+
+def told(capfd) -> dict:
+    return json.loads(capfd.readouterr().out)
+
+
+def test_every_frame_is_written_and_told(frames, capfd):
+    assert main(arguments("--json", "--report", "page.html")) == 0
+    records = told(capfd)["frames"]
+    assert [record["how"] for record in records] == ["fitted"] + ["followed"] * (COUNT - 1)
+    assert all(record["estimated_relmse"] > 0 and record["seconds"] > 0 for record in records)
+    assert list(outputs(frames)) == [f"f{number:04d}.exr" for number in range(COUNT)]
+    # A result reads like the input that it was made from.
+    again = read_buffers("out/f0002.exr")
+    np.testing.assert_array_equal(again.color.mean, read_buffers("noisy/f0002").color.mean)
+    assert np.isfinite(read_image("out/f0002.exr")).all()
+
+
+def test_the_page_shows_frames_and_curves(frames):
+    assert main(arguments("--report", "page.html", "--frames", "0-2,7")) == 2
+    page = (frames / "page.html").read_text()
+    assert len(re.findall(r'<img alt="frame \d" src="data:image/png', page)) == 3
+    assert page.count("<polyline") == 3
+    assert "frame 0: " in page
+    assert "without a result" in page
+    assert "noisy/f0007" in page
+    assert not re.search(r'(src|href)="(?!data:)', page)
+
+
+def test_finished_frames_are_skipped_and_changed_ones_are_not(frames):
+    assert main(arguments()) == 0
+    first = outputs(frames)
+    assert main(arguments()) == 0
+    assert outputs(frames) == first
+    os.utime(frames / "noisy/f0001/color.exr", ns=(1, 1))
+    (frames / "out/f0002.exr").write_bytes(first["f0002.exr"][:1000])
+    assert main(arguments()) == 0
+    second = outputs(frames)
+    changed = [name for name in first if first[name] != second[name]]
+    assert changed == ["f0001.exr", "f0002.exr"]
+    assert main(arguments("--refit", "0")) == 0
+    assert all(second[name] != content for name, content in outputs(frames).items())
+
+
+def test_other_threads_are_no_reason_to_do_it_again(frames):
+    assert main(arguments()) == 0
+    before = outputs(frames)
+    assert main(arguments("--threads", "2")) == 0
+    assert outputs(frames) == before
+
+
+def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
+    (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
+    (frames / "cameras/f0002.json").unlink()
+    assert main(arguments("--frames", "0-4")) == 2
+    error = capsys.readouterr().err
+    assert "3 of 5 frames have no result: 1, 2, 4; the others are done" in error
+    assert "Traceback" not in error
+    assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
+
+
+def test_bad_options_are_one_line(frames, capsys):
+    for more, message in (
+        (("--workers", "0"), "--workers: expected 1 or more"),
+        (("--refit", "some"), "expected auto, 0 or a number"),
+        (("--scheduler", "host"), "expected local or an address"),
+        (("--frames", "x"), "expected numbers"),
+        (("--preset", "paper"), "preset paper"),
+        (("--report", "page.txt"), "page.txt"),
+    ):
+        assert main(arguments(*more)) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert message in lines[0]
+    assert not outputs(frames)
+
+
+def test_a_killed_run_loses_the_frame_in_hand_alone(frames):
+    (frames / "out").mkdir()
+    (frames / "out/.f0003-0123abcd.exr").write_bytes(b"left by an earlier kill")
+    process = subprocess.Popen([*PROGRAM, *arguments()], cwd=frames)
+    try:
+        wait_for(lambda: len(outputs(frames)) >= 2 or process.poll() is not None)
+        process.kill()
+    finally:
+        process.wait()
+    finished = outputs(frames)
+    assert len(finished) >= 2
+    assert main(arguments()) == 0
+    now = outputs(frames)
+    assert len(now) == COUNT
+    assert {name: now[name] for name in finished} == finished
+
+
+def test_ctrl_c_keeps_what_is_finished_and_nothing_else(frames, capsys, monkeypatch):
+    real, calls = work.read_buffers, []
+
+    def interrupted_at_the_third(*given):
+        calls.append(given)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(work, "read_buffers", interrupted_at_the_third)
+    assert main(arguments()) == 130
+    assert list(outputs(frames)) == ["f0000.exr", "f0001.exr"]
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_a_fit_cut_short_by_ctrl_c_is_not_saved(frames, monkeypatch):
+    import tungsten_dip.fit.training as training
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "estimate_error", interrupted)
+    assert main(arguments()) == 130
+    assert not outputs(frames)
+
+
+def test_the_first_network_is_saved_and_used(frames):
+    assert main(arguments("--frames", "0", "--save-model", "m.onnx")) == 0
+    assert main(arguments("--frames", "1", "--warm-start", "m.onnx", "--refit", "0", "--json")) == 0
+
+
+# --- Several processes ---
+
+
+def wait_for(condition, seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A scheduler and two workers, each a process of its own; yields the scheduler's address."""
+    pytest.importorskip("distributed")
+    address_file = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "dask"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    scheduler = [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show"]
+    scheduler += ["--scheduler-file", str(address_file)]
+    processes = [subprocess.Popen(scheduler, stderr=subprocess.DEVNULL, env=environment)]
+    worker = [*dask, "worker", "--scheduler-file", str(address_file), "--nthreads", "1", "--no-dashboard"]
+    worker += ["--no-nanny", "--local-directory", str(tmp_path / "dask")]
+    try:
+        for _ in range(2):
+            processes.append(subprocess.Popen(worker, stderr=subprocess.DEVNULL, env=environment))
+        wait_for(address_file.is_file)
+        yield json.loads(address_file.read_text())["address"]
+    finally:
+        for process in processes[::-1]:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+
+
+def test_a_worker_killed_within_a_frame_loses_nothing(frames, cluster):
+    from distributed import Client
+
+    with Client(cluster) as client:
+        client.wait_for_workers(2, timeout=60)
+        pids = client.run(os.getpid)
+        process = subprocess.Popen(
+            [*PROGRAM, *arguments("--scheduler", cluster, "--json")], stdout=subprocess.PIPE, text=True
+        )
+        # Frames 0 and 1 are the first task; whoever works after that does so on one of the others.
+        wait_for(lambda: len(outputs(frames)) >= 2 or process.poll() is not None)
+        busy: list[str] = []
+
+        def someone_works() -> bool:
+            busy[:] = [address for address, tasks in client.processing().items() if tasks]
+            return bool(busy) or process.poll() is not None
+
+        wait_for(someone_works)
+        assert busy, "all frames were done before a worker could be killed"
+        os.kill(pids[busy[0]], signal.SIGKILL)
+        output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    records = json.loads(output)["frames"]
+    assert [record["number"] for record in records] == list(range(COUNT))
+    assert all(record["error"] is None for record in records)
+    assert len(outputs(frames)) == COUNT
+
+
+def test_local_workers_do_what_one_does(frames, capsys):
+    pytest.importorskip("distributed")
+    assert main(arguments("--workers", "2", "--json", "--frames", "0-3,9")) == 2
+    assert "1 of 5 frames have no result: 9" in capsys.readouterr().err
+    assert len(outputs(frames)) == COUNT
+    # All are finished: no worker is needed, and what one process finds is the same.
+    before = outputs(frames)
+    assert main(arguments()) == 0
+    assert outputs(frames) == before
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(frames, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    from tungsten_dip.sequence import cluster as module
+
+    monkeypatch.setattr(module, "_CONNECT_TIMEOUT_S", 1)
+    assert main(arguments("--scheduler", "tcp://127.0.0.1:9")) == 2
+    assert "no scheduler answers" in capsys.readouterr().err
