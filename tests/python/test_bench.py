@@ -55,7 +55,7 @@ def fits(monkeypatch):
         return FitResult(color, settings, 0.0, len(calls))
 
     monkeypatch.setattr("tungsten_dip.fit.denoise", denoise)
-    monkeypatch.setattr("tungsten_dip.bench.pareto._warm_up", lambda bench_set, plan: None)
+    monkeypatch.setattr("tungsten_dip.bench.pareto._warm_up", lambda bench_set, plan, series: None)
     monkeypatch.setattr("tungsten_dip.bench.pareto.write_pareto_plot", lambda folder, found: None)
     monkeypatch.setattr("tungsten_dip.bench.pareto.pareto_page", lambda found, facts, repeats: "the page")
     return calls

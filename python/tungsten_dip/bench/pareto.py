@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tungsten_dip.bench.machine import machine_facts
-from tungsten_dip.bench.methods import Plan, methods_for
+from tungsten_dip.bench.methods import IN_TIME, OIDN, OURS, PAPER, SAMPLES, Plan, methods_for
 from tungsten_dip.bench.page import pareto_page
 from tungsten_dip.bench.plot import require_matplotlib, write_pareto_plot
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
 from tungsten_dip.buffers import Buffer, RenderBuffers
+from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.progress import Progress, silent
 
 
@@ -40,8 +41,7 @@ def run_pareto(
             if (method.timed or repeat == 0)
         ]
     )
-    if any(task.method.timed for task in tasks):
-        _warm_up(sets[0], plan)
+    _warm_up(sets[0], plan, {task.method.series for task in tasks})
     runner.run(tasks, progress)
 
     found = []
@@ -64,16 +64,19 @@ def run_pareto(
     return found
 
 
-def _warm_up(bench_set: BenchSet, plan: Plan) -> None:
-    """Load every library that is measured, so that no measurement pays for it."""
+def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
+    """Load every library that is about to be measured, so that no measurement pays for it."""
     from tungsten_dip.fit import FitSettings, denoise
+    from tungsten_dip.hosts import render
 
     corner = {
         name: Buffer(**{plane: np.ascontiguousarray(array[:16, :16]) for plane, array in buffer.planes()})
         for name, buffer in bench_set.buffers.quantities()
     }
     tiny = RenderBuffers(corner.pop("color")).with_quantities(**corner)
-    denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
-    small = Plan(("oidn",), repeats=1, threads=plan.threads)
-    for method in methods_for([BenchSet("", tiny, tiny.color.mean, None, "")], small)[""]:
-        method.run(0, silent)
+    if not {OURS, IN_TIME, PAPER}.isdisjoint(series):
+        denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
+    if OIDN in series:
+        oidn_image(tiny.color.mean, threads=plan.threads)
+    if SAMPLES in series:
+        render(plan.scenes[0], spp=1, threads=plan.threads)
