@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import get_args
 
@@ -146,9 +146,6 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool
         for preset in plan.presets:
             settings = FitSettings(preset, threads=plan.threads)
             yield _ours(bench_set, OURS, preset, preset, settings, pictured=True)
-            if preset == "final" and has_oidn and "pilot" in (field.name for field in fields(settings)):
-                guided = FitSettings(**{**asdict(settings), "pilot": "oidn"})
-                yield _ours(bench_set, OURS, "final, guided by OIDN", "guided", guided, pictured=True)
     if "budgets" in plan.kinds:
         for budget_s in plan.budgets_s:
             settings = FitSettings("final", time_budget_s=budget_s, threads=plan.threads)
