@@ -15,6 +15,7 @@ from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import silent
+from tungsten_dip.sequence.following import Followed
 
 SCENE = {
     "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
@@ -410,7 +411,7 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     ]
     finished = tungsten_dip.fit.denoise
 
-    def interrupted(buffers, settings, progress, warm_start):
+    def interrupted(buffers, settings, progress):
         if fits:
             raise KeyboardInterrupt
         return finished(buffers, settings, progress)
@@ -428,6 +429,30 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
         "two.exr",
     }
     assert capfd.readouterr().err.splitlines()[-1] == "tungsten: interrupted"
+
+
+def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, capfd, monkeypatch):
+    calls = []
+
+    class Follower:
+        def __init__(self, settings, models):
+            assert settings.preset == "draft"
+            assert models.first is None
+
+        def denoise(self, buffers, camera, progress):
+            calls.append(camera.resolution)
+            return Followed(FitResult(buffers.color.mean, FitSettings(), 1.0, 1), "followed")
+
+    monkeypatch.setattr("tungsten_dip.sequence.following.Follower", Follower)
+    scenes = [
+        str(write_scene(tmp_path / f"f{number}.json", output_file=f"f{number}.png", output_buffers=[]))
+        for number in range(3)
+    ]
+    assert tungsten.main(["--dip-denoise", "--dip-preset", "draft", "--seed", "5", *scenes]) == 0
+    assert calls == [(17, 9)] * 3
+    assert all((tmp_path / f"f{number}_denoised.exr").exists() for number in range(3))
+    # The same noise in every frame would not average out.
+    assert [call["seed"] for call in renders] == [5, 6, 7]
 
 
 def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_path, renders, capfd):

@@ -6,7 +6,9 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tungsten_dip
 from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
@@ -23,7 +25,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, require_torch
+from tungsten_dip.fit import FitResult, FitSettings, require_torch
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.progress import Progress
@@ -31,7 +33,10 @@ from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import display_from_radiance
-from tungsten_dip.scene.types import Scene
+from tungsten_dip.scene.types import Camera, PinholeCamera, Scene, ThinlensCamera
+
+if TYPE_CHECKING:
+    from tungsten_dip.sequence.following import Follower
 
 log = logging.getLogger(__name__)
 
@@ -50,13 +55,15 @@ def denoise_outputs(
     remarks: Sequence[str] = (),
     warm_start: Model | None = None,
     save_model: Path | None = None,
+    frame: Callable[[RenderBuffers], FitResult] | None = None,
 ) -> None:
     """Denoise a render and write the result beside its own files.
 
     Writes ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked for,
-    the report and the fitted network. ``remarks`` are lines on the render for the report.
+    the report and the fitted network. ``remarks`` are lines on the render for the report. ``frame`` denoises
+    one of several frames; settings and warm start are then its own affair.
     """
-    result = denoise_with_progress(buffers, settings, warm_start)
+    result = frame(buffers) if frame else denoise_with_progress(buffers, settings, warm_start)
     exr, png, pair = _denoised_paths(outputs)
     noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))
     write_denoised(exr, result, buffers)
@@ -103,10 +110,18 @@ def _run(arguments: Sequence[str] | None) -> None:
 
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
+    follower = None
+    if options.dip_denoise and len(options.scenes) > 1 and settings.preset != "paper":
+        from tungsten_dip.sequence.following import Follower, Models
+
+        follower = Follower(settings, models=Models(first=warm_start))
     failed = 0
-    for path in options.scenes:
+    for index, path in enumerate(options.scenes):
+        # The same noise in every frame would not average out.
+        seed = options.seed if index == 0 or follower is None else (options.seed or 0) + index
+        of_frame = argparse.Namespace(**{**vars(options), "seed": seed})
         try:
-            _render_scene(path, host, options, settings, warm_start)
+            _render_scene(path, host, of_frame, settings, warm_start, follower)
         except InputError as error:
             if len(options.scenes) == 1:
                 raise
@@ -162,8 +177,12 @@ def _render_scene(
     options: argparse.Namespace,
     settings: FitSettings,
     warm_start: Model | None,
+    follower: Follower | None,
 ) -> None:
-    """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files."""
+    """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
+
+    With ``follower``, the scene is one of several frames.
+    """
     scene = load_scene(path, options.input_directory)
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
@@ -209,7 +228,16 @@ def _render_scene(
                 remarks,
                 warm_start,
                 options.save_model,
+                None if follower is None else partial(_follow, follower, scene.camera),
             )
+
+
+def _follow(follower: Follower, camera: Camera, buffers: RenderBuffers) -> FitResult:
+    """Denoise a frame, starting from the one before."""
+    # A camera that frames cannot be moved with is none.
+    known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
+    with progress_on_stderr("denoising") as progress:
+        return follower.denoise(buffers, known, progress).result
 
 
 def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten_host.Rendered], None]:

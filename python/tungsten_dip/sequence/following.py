@@ -14,13 +14,13 @@ from typing import Literal
 
 import numpy as np
 
+from tungsten_dip import fit
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import denoise
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.onnx.inference import infer
+from tungsten_dip.onnx import inference
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker
@@ -103,7 +103,7 @@ class Follower:
             _LOG.info("a cut: %s", cut)
             how, followed = "cut", None
         if followed is None:
-            followed = Followed(denoise(buffers, self._settings, progress), how)
+            followed = Followed(fit.denoise(buffers, self._settings, progress), how)
             self.models = replace(self.models, first=followed.result.model)
         result = followed.result
         self._error = _typical_error(result)
@@ -126,12 +126,12 @@ class Follower:
             steps = _MOST_STEPS if self._refit == "auto" else self._refit
             threads = self._settings.threads
             try:
-                result = infer(model, buffers, threads, progress, refit_steps=steps, previous=moved)
+                result = inference.infer(model, buffers, threads, progress, refit_steps=steps, previous=moved)
             except InputError as problem:
                 raise _CutError(str(problem)) from problem
         elif moved is not None:
             settings = replace(self._settings, iterations=_FIRST_FOLLOWING_STEPS)
-            result = denoise(buffers, settings, progress, previous=moved)
+            result = fit.denoise(buffers, settings, progress, previous=moved)
         else:
             return None
         error = _typical_error(result)
