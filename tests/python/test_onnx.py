@@ -285,6 +285,12 @@ def test_onnxruntime_uses_as_many_threads_as_it_may(
         infer(model, frame.buffers, refit_steps=-1)
 
 
+def test_weights_that_overflow_are_refused(model: Model, frame: SyntheticRender) -> None:
+    weights = {name: np.full_like(weight, 3e38) for name, weight in model.weights.items()}
+    with pytest.raises(InputError, match="no finite image"):
+        infer(replace(model, weights=weights), frame.buffers, threads=1)
+
+
 # --- Files ------------------------------------------------------------------------------------------
 
 
@@ -498,6 +504,8 @@ def whole_metadata(value: str) -> Spoil:
     return spoil
 
 
+PILOT = '{"k": null, "radius": 1, "step": 1, "with_position": false}, '
+
 HOSTILE: list[tuple[Spoil, str]] = [
     (external, "within the file"),
     (external_beside_raw, "within the file"),
@@ -526,6 +534,8 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"candidates": 0', '"candidates": 1000000000000'), "planes|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
     (metadata('"step": 1', '"step": 0'), "radius"),
+    (metadata('"k": 1.0', '"k": 1e-30'), "k from"),
+    (metadata('"pilots": [', '"pilots": [' + 70 * PILOT), "at most 64 images"),
     (metadata('"step": 1', '"step": true'), "step"),
     (metadata('"with_position"', '"mean"'), "pilots"),
     (metadata('"preset": "draft"', '"preset": ["draft"]'), "preset"),

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import onnx
@@ -44,9 +44,7 @@ _NO_ONNX = "expected an ONNX model, this is none or cut short; save it anew with
 _MOST_PARTS = 1 << 16
 _LARGEST_COUNT = 1 << 16
 _LARGEST_RADIUS = 64
-_MOST_CANDIDATES = 64
-
-T = TypeVar("T")
+_MOST_CHOICES = 64
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -235,11 +233,15 @@ def _layout(facts: dict[str, Any]) -> Layout:
         radius, step = pilots[-1].radius, pilots[-1].step
         if not 0 < step <= radius <= _LARGEST_RADIUS or radius % step:
             raise InputError(f"pilots: expected a radius up to {_LARGEST_RADIUS}, a multiple of step")
+        if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
+            raise InputError("pilots: expected k from 0.01 to 100")
     features = _checked("features", facts.get("features"), tuple[str, ...])
     candidates, reference = (_checked(n, facts.get(n), int) for n in ("candidates", "reference"))
     layout = Layout(features, tuple(pilots), candidates, reference)
-    if not pilots or not 0 <= candidates <= _MOST_CANDIDATES or not 0 < reference < layout.choices:
-        raise InputError("layout: expected a pilot and a reference among the pilots")
+    if not pilots or layout.choices > _MOST_CHOICES or not 0 < reference < layout.choices:
+        raise InputError(
+            f"layout: expected one pilot or more, and at most {_MOST_CHOICES} images to choose from"
+        )
     return layout
 
 

@@ -14,6 +14,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import (
     PLANES_RADIUS,
+    Array,
     Evidence,
     Halves,
     checked_candidates,
@@ -53,7 +54,8 @@ def infer(
     result's ``model`` is then the refined one. A network of the preset paper gives the image by itself, and
     no error is known.
 
-    Raises InputError if the image is empty, the model does not fit it, or refit_steps cannot be done.
+    Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
+    refit_steps cannot be done.
     """
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
@@ -139,7 +141,7 @@ def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
             planes = [plane[first - above : end - above] for plane in planes_of_half(around, half)]
             pilots = [pilot[half].transpose(2, 0, 1) for pilot in band.pilots]
             feeds = {"inputs": np.stack(planes)[None], "pilots": np.stack(pilots)[None]}
-            fused[first:end] = session.run(["color"], feeds)[0][0].transpose(1, 2, 0)
+            fused[first:end] = _finite(session.run(["color"], feeds)[0])[0].transpose(1, 2, 0)
     return fused_a, fused_b
 
 
@@ -152,8 +154,15 @@ def _infer_paper(
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
     # Norms of the whole image: no bands here.
     session = session_from_proto(graph_of(model, metadata={}), settings.threads or 0)
-    ldr = session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0][0, :3].transpose(1, 2, 0)
+    output = _finite(session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0])
+    ldr = output[0, :3].transpose(1, 2, 0)
     color: FloatImage = np.ascontiguousarray(radiance_from_ldr(ldr))
     progress(1.0, "inferred")
     seconds = time.perf_counter() - started
     return FitResult(color, settings, seconds, iterations=0, model=model, notes=images.notes)
+
+
+def _finite(output: Array) -> Array:
+    if not np.isfinite(output).all():
+        raise InputError("the model gives no finite image: its weights are too large; fit a new one")
+    return output
