@@ -459,7 +459,7 @@ def _scaled(image: FloatImage, scale: float) -> FloatImage:
 
 def _denominators(smooth: Halves) -> Halves:
     """What squared errors are relative to, per half, shape (height, width, 1)."""
-    a, b = (image.mean(axis=2, keepdims=True) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
+    a, b = (_channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
     return a, b
 
 
@@ -470,8 +470,14 @@ def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
 
 
 def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
-    error: FloatImage = ((image - other) ** 2).mean(axis=2, keepdims=True) / denominator
+    error: FloatImage = _channel_mean((image - other) ** 2) / denominator
     return error
+
+
+def _channel_mean(image: FloatImage) -> FloatImage:
+    """Return the mean of three channels, shape (height, width, 1), faster than numpy's along a short axis."""
+    mean: FloatImage = (image[..., 0] + image[..., 1] + image[..., 2])[..., None] * np.float32(1 / 3)
+    return mean
 
 
 def _capped(error: FloatImage, threads: int) -> FloatImage:
@@ -481,7 +487,7 @@ def _capped(error: FloatImage, threads: int) -> FloatImage:
 
 
 def _log_level(image: FloatImage) -> FloatImage:
-    log_level: FloatImage = np.log(image.mean(axis=2, keepdims=True) + np.float32(_LOG_OFFSET))
+    log_level: FloatImage = np.log(_channel_mean(image) + np.float32(_LOG_OFFSET))
     return log_level
 
 

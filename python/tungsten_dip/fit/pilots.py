@@ -75,7 +75,7 @@ BALANCED_PILOTS = (
 )
 FINAL_PILOTS = (*BALANCED_PILOTS, Pilot(2, k=1.0), Pilot(9, k=0.5), Pilot(9, k=1.0, with_position=True))
 
-FOLLOWING_PILOTS = (Pilot(2), Pilot(6, k=2.0))
+FOLLOWING_PILOTS = (Pilot(2), Pilot(5, k=2.0))
 """Enough beside what the previous frame shows. The first stands where that shows nothing."""
 
 

@@ -38,7 +38,7 @@ _MOST_STEPS = 240
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
 
-_CUT_ERROR = 3.0
+_CUT_ERROR = 5.0
 """How many times the previous frame's error tells of a cut."""
 
 
