@@ -363,3 +363,29 @@ def test_settings_come_back_with_the_result(render: SyntheticRender) -> None:
     settings = _settings(iterations=1, seed=9)
     assert denoise(render.buffers, settings).settings == settings
     assert replace(settings, seed=1) != settings
+
+
+def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
+    """What is known of the image beats what the samples tell; where nothing is known, the samples do."""
+    buffers, reference = render.buffers, render.reference
+    height = buffers.height
+    known = reference.copy()
+    known[height // 2 :] = np.nan
+    settings = FitSettings(preset="draft", threads=1)
+    result = denoise(buffers, settings, previous=(known, known))
+    alone = denoise(buffers, settings)
+    assert np.isfinite(result.color).all()
+    assert result.model.layout.candidates == 1
+
+    def error(image, rows):
+        return float(np.mean((image[rows] - reference[rows]) ** 2))
+
+    top, bottom = slice(0, height // 2 - 2), slice(height // 2 + 2, None)
+    assert error(result.color, top) < 0.8 * error(alone.color, top)
+    assert error(result.color, bottom) < 0.5 * error(buffers.color.mean, bottom)
+
+
+def test_a_previous_frame_of_another_size_is_refused(render):
+    wrong = np.zeros((3, 4, 3), np.float32)
+    with pytest.raises(InputError, match="previous, half A: expected shape"):
+        denoise(render.buffers, FitSettings(preset="draft"), previous=(wrong, wrong))
