@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,10 +91,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     run = Run(settings, options.refit, dict(options.map), options.half)
     models = Models(first=warm_start)
 
-    # What is the same for all frames is not told for each.
-    for name in ("buffers", "fit", "onnx"):
-        logging.getLogger(f"tungsten_dip.{name}").setLevel(logging.WARNING)
-    with progress_on_stderr("denoising") as progress:
+    with _without_repetition(), progress_on_stderr("denoising") as progress:
         if options.scheduler == "local" and options.workers == 1:
             records, models = denoise_frames(frames, run, models, progress, _tell)
         else:
@@ -113,6 +111,20 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     seconds = sum(record.seconds for record in records)
     facts = {"frames": [asdict(record) for record in records]}
     return facts, f"{len(records)} frames, denoised in {seconds:.1f} s in all"
+
+
+@contextmanager
+def _without_repetition() -> Iterator[None]:
+    """Keep back what would be told of every frame in the same words."""
+    loggers = [logging.getLogger(f"tungsten_dip.{name}") for name in ("buffers", "fit", "onnx")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _tell(record: Record) -> None:
