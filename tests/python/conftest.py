@@ -28,16 +28,17 @@ MakeRender = Callable[..., SyntheticRender]
 @pytest.fixture
 def make_render() -> MakeRender:
     """``make_render(height=40, width=56, spp=16, seed=0)``: a sphere on a checkered floor before a sky."""
-    return _make_render
+    return synthetic_render
 
 
 @pytest.fixture
 def render() -> SyntheticRender:
     """The synthetic render at its default size."""
-    return _make_render()
+    return synthetic_render()
 
 
-def _make_render(height: int = 40, width: int = 56, spp: int = 16, seed: int = 0) -> SyntheticRender:
+def synthetic_render(height: int = 40, width: int = 56, spp: int = 16, seed: int = 0) -> SyntheticRender:
+    """Return a sphere on a checkered floor before a sky, rendered with independent samples."""
     rng = np.random.default_rng(seed)
     truth = _ground_truth(height, width)
     cosine = truth["normal"] @ np.array([0.4, 0.8, 0.45])

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings, strategies
 from onnx import TensorProto, helper
 
-from conftest import SyntheticRender, _make_render
+from conftest import SyntheticRender, synthetic_render
 from tungsten_dip.buffers import Buffer, RenderBuffers, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
@@ -49,12 +49,12 @@ DRAFT = FitSettings("draft", iterations=20, threads=1, device="cpu")
 
 @pytest.fixture(scope="module")
 def frame() -> SyntheticRender:
-    return _make_render(32, 48)
+    return synthetic_render(32, 48)
 
 
 @pytest.fixture(scope="module")
 def next_frame() -> SyntheticRender:
-    return _make_render(32, 48, seed=1)
+    return synthetic_render(32, 48, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +226,7 @@ def test_bands_make_no_difference(
 @settings(max_examples=20, deadline=None)
 @given(height=strategies.integers(1, 20), width=strategies.integers(1, 20), seed=strategies.integers(0, 99))
 def test_inference_takes_any_size(height: int, width: int, seed: int, model: Model) -> None:
-    buffers = _make_render(height, width, seed=seed).buffers
+    buffers = synthetic_render(height, width, seed=seed).buffers
     try:
         result = infer(model, buffers, threads=1)
     except InputError as error:
@@ -726,7 +726,7 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
 
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
-    evidence = evidence_of(_make_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
+    evidence = evidence_of(synthetic_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
 
     def standardised(inputs: Any) -> Standardisation:
         return Standardisation(inputs.mean((0, 1), np.float64), inputs.std((0, 1)) + np.float32(1e-3))

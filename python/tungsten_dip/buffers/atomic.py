@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import re
 import secrets
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tungsten_dip.errors import InputError
@@ -16,17 +19,21 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; what was written there replaces ``path`` on leaving.
 
     The temporary file has the suffix of ``path``. If the block raises, it is removed and ``path`` stays as
-    it was. A process killed halfway leaves ``path`` as it was too.
+    it was. A process killed halfway leaves ``path`` as it was too, and a hidden temporary file, which goes
+    when ``path`` is next written.
 
     Raises InputError if the file system refuses (no such folder, read-only, full).
     """
     target = path.resolve()
-    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(4)}{target.suffix}")
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
     try:
-        yield temporary
-        with temporary.open("rb+") as written:
-            os.fsync(written.fileno())
-        temporary.replace(target)
+        _remove_left_by_the_dead(target)
+        with temporary.open("xb") as lock:
+            _try_to_lock(lock.fileno())
+            yield temporary
+            with temporary.open("rb+") as written:
+                os.fsync(written.fileno())
+            temporary.replace(target)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
@@ -43,12 +50,34 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
     if path.is_dir():
         raise InputError(f"{path}: expected the name of a file, this is a folder")
-    probe = path.resolve().with_name(f".{secrets.token_hex(8)}")
     try:
-        probe.touch(exist_ok=False)
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=path.resolve().parent):
+            pass
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
 
 
+def _remove_left_by_the_dead(target: Path) -> None:
+    """Remove temporary files of ``target`` whose writers live no more: these alone are not locked."""
+    name = re.compile(
+        re.escape(f".{target.stem}-") + f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}" + re.escape(target.suffix)
+    )
+    with suppress(OSError):
+        for path in target.parent.iterdir():
+            if name.fullmatch(path.name):
+                with path.open("rb") as left:
+                    if _try_to_lock(left.fileno()):
+                        path.unlink()
+
+
+def _try_to_lock(file: int) -> bool:
+    """Lock a file for as long as it is open; return whether nobody else has. Some file systems have no locks."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+_TOKEN_BYTES = 4
 _REMEDY = "choose an existing folder that you may write to, on a disk with room"
