@@ -140,4 +140,13 @@ struct RegressionWindow {
 void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
              ConstImage guide_variance, const RegressionWindow& window, Image out, int threads);
 
+// --- steering.cpp
+
+// Averages an image along the edges of the features: around every pixel by a Gaussian with standard
+// deviations `along` and `across` (in pixels) the edge, whose direction is that of the features' structure
+// tensor (Feng and Milanfar 2002, "Multiscale principal components analysis for image local orientation
+// estimation"; Takeda et al. 2007, "Kernel Regression for Image Processing and Reconstruction").
+void smooth_along_edges(ConstImage image, ConstImage features, float along, float across, Image out,
+                        int threads);
+
 }  // namespace tungsten_dip

@@ -11,15 +11,8 @@
 
 #include "core.hpp"
 #include "exp_minus.hpp"
-
-// The inner loops are compiled twice, and the faster one chosen when the program starts. Sanitizers cannot
-// run before that choice.
-#if defined(__x86_64__) && defined(__linux__) && !defined(__SANITIZE_ADDRESS__) && \
-    !defined(__SANITIZE_THREAD__)
-#define TUNGSTEN_DIP_FASTEST __attribute__((target_clones("arch=x86-64-v3", "default")))
-#else
-#define TUNGSTEN_DIP_FASTEST
-#endif
+#include "fastest.hpp"
+#include "padded_planes.hpp"
 
 namespace tungsten_dip {
 namespace {
@@ -33,52 +26,6 @@ constexpr int max_features = 16;
 // Distances of the guide below this are equal whatever its variance says.
 constexpr float least_variance = 1e-8F;
 constexpr float least_weight_sum = 1e-20F;
-
-// An image's channels one after the other, [channel][y][x], with its border repeated `margin` pixels
-// outwards: no loop needs to ask where the image ends.
-class PaddedPlanes {
-  public:
-    PaddedPlanes(int channels, int height, int width, int margin)
-        : channels_(channels),
-          height_(height),
-          width_(width),
-          margin_(margin),
-          stride_(width + 2 * margin),
-          pixels_(static_cast<std::size_t>(channels) * static_cast<std::size_t>(height + 2 * margin) *
-                  static_cast<std::size_t>(stride_)) {}
-
-    PaddedPlanes(ConstImage image, int margin, int threads)
-        : PaddedPlanes(image.channels, image.height, image.width, margin) {
-        parallel_for(height_ + 2 * margin, threads, [&](int i) {
-            const int y = i - margin;
-            const int from_y = std::clamp(y, 0, height_ - 1);
-            for (int c = 0; c < channels_; ++c) {
-                float* to = row(c, y);
-                for (int x = -margin; x < width_ + margin; ++x) {
-                    to[x] = image.at(from_y, std::clamp(x, 0, width_ - 1), c);
-                }
-            }
-        });
-    }
-
-    [[nodiscard]] int channels() const { return channels_; }
-    [[nodiscard]] int height() const { return height_; }
-    [[nodiscard]] int width() const { return width_; }
-    [[nodiscard]] float* row(int c, int y) { return pixels_.data() + offset(c, y); }
-    [[nodiscard]] const float* row(int c, int y) const { return pixels_.data() + offset(c, y); }
-
-  private:
-    [[nodiscard]] std::ptrdiff_t offset(int c, int y) const {
-        return (static_cast<std::ptrdiff_t>(c) * (height_ + 2 * margin_) + y + margin_) * stride_ + margin_;
-    }
-
-    int channels_;
-    int height_;
-    int width_;
-    int margin_;
-    std::ptrdiff_t stride_;
-    std::vector<float> pixels_;
-};
 
 struct Tile {
     int y;

@@ -93,3 +93,11 @@ def regress(
     exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``.
     At most 16 features; everything must be finite. See ``regress`` in core.hpp.
     """
+
+def smooth_along_edges(
+    image: FloatImage, features: FloatImage, *, along: float, across: float, threads: int = 0
+) -> FloatImage:
+    """Return ``image``, averaged by a Gaussian that follows the edges of ``features``.
+
+    ``along`` and ``across`` are its standard deviations in pixels. See ``smooth_along_edges`` in core.hpp.
+    """

@@ -29,7 +29,7 @@ from tungsten_dip.fit.pilots import (
     Pilot,
     first_pilots,
     following_pilots,
-    guidance_from_buffers,
+    guidance_of_halves,
     pilot_images,
 )
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
@@ -116,7 +116,7 @@ class Evidence:
 
     scale: float
     mean: FloatImage
-    guidance: Guidance
+    guidance: tuple[Guidance, ...]
     layout: Layout
     pilots: tuple[Halves, ...]
     noises: Halves
@@ -138,15 +138,11 @@ class Evidence:
         def cut(images: Halves) -> Halves:
             return images[0][first:end], images[1][first:end]
 
-        guidance = replace(
-            self.guidance,
-            features=self.guidance.features[first:end],
-            albedo=self.guidance.albedo[first:end],
-        )
+        a, b = (guidance.rows(first, end) for guidance in self.guidance)
         return replace(
             self,
             mean=self.mean[first:end],
-            guidance=guidance,
+            guidance=(a, b),
             pilots=tuple(cut(pilot) for pilot in self.pilots),
             noises=cut(self.noises),
         )
@@ -218,11 +214,7 @@ def evidence_from_buffers(
     color = buffers.color
     variance = None if color.variance is None else _scaled(_scaled(color.variance, scale), scale)
     threads = settings.threads or 0
-    guidance = guidance_from_buffers(buffers, threads)
-    progress(0.05, "features")
     layout = pilots if isinstance(pilots, Layout) else None
-    if layout is not None:
-        _check_fits(layout, guidance, len(candidates) + (previous is not None))
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
     test = halves_independent(buffers, settings.threads)
@@ -234,8 +226,11 @@ def evidence_from_buffers(
             notes.append(_why_no_halves(buffers, test))
             if candidates or previous is not None:
                 notes.append("the candidates are not used: nothing can score them")
-            guides, irradiances, noise = first_pilots((_scaled(color.mean, scale),), variance, guidance)
-            (image,) = pilot_images(_ONLY_PILOT, irradiances, guides, noise, guidance)
+            colors = (_scaled(color.mean, scale),)
+            guidance = guidance_of_halves(buffers, colors, scale, threads)
+            progress(0.2, "features")
+            guides, irradiances, noise = first_pilots(colors, variance, guidance)
+            (image,) = pilot_images(_ONLY_PILOT, colors, irradiances, guides, noise, guidance)
             image /= np.float32(scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
@@ -247,6 +242,10 @@ def evidence_from_buffers(
     if fireflies is not None:
         notes.append(fireflies)
         mean = np.float32(0.5) * (halves[0] + halves[1])
+    guidance = guidance_of_halves(buffers, halves, scale, threads)
+    progress(0.1, "features")
+    if layout is not None:
+        _check_fits(layout, guidance[0], len(candidates) + (previous is not None))
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
     if previous is None:
@@ -261,7 +260,7 @@ def evidence_from_buffers(
         if layout is None and index > 0 and late:
             break
         if pilot not in computed:
-            image_a, image_b = pilot_images(pilot, irradiances, guides, noise, guidance)
+            image_a, image_b = pilot_images(pilot, halves, irradiances, guides, noise, guidance)
             computed[pilot] = image_a, image_b
         images.append(computed[pilot])
     described = described[: len(images) - 1]
@@ -275,7 +274,7 @@ def evidence_from_buffers(
     if layout is None:
         mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
         best = 1 + int(np.argmin(mean_errors))
-        layout = Layout(guidance.names, described, len(images) - 1 - len(described), reference=best)
+        layout = Layout(guidance[0].names, described, len(images) - 1 - len(described), reference=best)
     noise_a, noise_b = (
         mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[layout.reference]
     )
@@ -301,9 +300,9 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
 
     A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
     """
-    threads, layout = evidence.guidance.threads, evidence.layout
+    threads, layout = evidence.guidance[0].threads, evidence.layout
     for name in layout.features:
-        yield _feature(evidence.guidance, name)
+        yield _feature(evidence.guidance[half], name)
     noise = evidence.noises[half]
     yield np.log(noise + np.float32(1e-4))[:, :, 0]
     base = _log_level(evidence.pilots[layout.reference][half])
@@ -399,7 +398,7 @@ def result_from_fused(
     notes: Sequence[str] = (),
 ) -> FitResult:
     """Make the result of what the network made of each half, or of the input if that is as good."""
-    threads = evidence.guidance.threads
+    threads = evidence.guidance[0].threads
     shape = fused[0].shape
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
     unbiased, spread, estimate = estimate_error(fused_a, fused_b, witnesses(evidence))

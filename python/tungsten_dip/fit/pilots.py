@@ -7,12 +7,12 @@ predict is scored by the other half, whose noise they have never seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 
 # Features are scaled so that one unit is a difference which separates two surfaces; these penalties of
@@ -41,6 +41,9 @@ _LEAST_GUIDE_VARIANCE = 1e-5
 
 _Pair = tuple[FloatImage, FloatImage]
 
+_ACROSS_EDGES = 0.3
+"""Standard deviation, in pixels, of the mean along edges in the direction across them."""
+
 _CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 
 _SAMPLES_OF_FIRST_WINDOW = 12
@@ -49,23 +52,31 @@ _SAMPLES_OF_FIRST_WINDOW = 12
 
 @dataclass(frozen=True)
 class Pilot:
-    """One window of regression. ``k`` None: neighbours are weighed by features alone, not by a guide."""
+    """One window of regression. ``k`` None: neighbours are weighed by features alone, not by a guide.
+
+    ``along_edges``: no regression, but the mean along the edges of the features, with the standard deviation
+    ``radius``. It shows how much of a pixel each surface covers better than the samples in the pixel do.
+    """
 
     radius: int
     k: float | None = None
     step: int = 1
     with_position: bool = False
+    along_edges: bool = False
 
 
 FIRST_GUIDE = Pilot(radius=3)
 FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
 """Where no feature shows an edge, a window blurs every one within it."""
 
+EDGES = Pilot(3, along_edges=True)
+
 # In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
 # shadows and reflections, which no feature shows; a regression on the position follows gradients.
-DRAFT_PILOTS = (Pilot(1), Pilot(5), Pilot(5, k=1.0))
+DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(5), Pilot(5, k=1.0))
 BALANCED_PILOTS = (
     Pilot(1),
+    EDGES,
     Pilot(5),
     Pilot(12, step=2, with_position=True),
     Pilot(4, k=1.0),
@@ -81,11 +92,13 @@ FOLLOWING_PILOTS = (Pilot(2), Pilot(5, k=2.0))
 
 @dataclass(frozen=True)
 class Guidance:
-    """What all pilots share: features to regress on and the albedo that divides the colour.
+    """What all pilots of one half share: features to regress on, and what parts the colour from its surface.
 
     ``features`` has shape (height, width, n), noise-reduced, scaled, without those that are the same in
     every pixel, called ``names``; ``penalty`` one value for each. ``left_out`` holds the value of each of the
-    others. ``albedo`` has shape (height, width, 3), never 0.
+    others. ``albedo``, shape (height, width, 3), divides the colour and is never 0. ``emission`` is the
+    radiance that the half's own samples saw lights emit, which is taken from the colour before,
+    ``smooth_emission`` what is given back.
     """
 
     features: FloatImage
@@ -93,101 +106,195 @@ class Guidance:
     left_out: dict[str, float]
     penalty: tuple[float, ...]
     albedo: FloatImage
+    emission: FloatImage
+    smooth_emission: FloatImage
     threads: int
 
+    def rows(self, first: int, end: int) -> Guidance:
+        """Return the guidance of some rows alone."""
+        names = ("features", "albedo", "emission", "smooth_emission")
+        return replace(self, **{name: getattr(self, name)[first:end] for name in names})
 
-def guidance_from_buffers(buffers: RenderBuffers, threads: int) -> Guidance:
-    """Pre-filter, scale and select the features of sanitised buffers."""
+    def irradiance(self, color: FloatImage) -> FloatImage:
+        """Return what falls on the surfaces that a half shows in ``color``."""
+        irradiance: FloatImage = (color - self.emission) / self.albedo
+        return irradiance
+
+    def color(self, irradiance: FloatImage) -> FloatImage:
+        """Return the radiance, never negative, that surfaces and lights send back."""
+        color: FloatImage = np.maximum(irradiance, 0) * self.albedo + self.smooth_emission
+        return color
+
+
+def guidance_of_halves(
+    buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
+) -> tuple[Guidance, ...]:
+    """Pre-filter, scale and select the features of sanitised buffers; return the guidance of every colour.
+
+    ``colors`` are the two halves, or the mean alone, in the renderer's units times ``scale``. What guides a
+    half is made of its own samples alone (the other half only says which of them to average), since errors
+    that a half's features share with the colour that scores them would pass for truth.
+    """
+    shown = tuple(color / np.float32(scale) for color in colors)
+    albedos: tuple[FloatImage, ...] = ()
+    if buffers.albedo is not None:
+        given = buffers.albedo
+        # Above 1 it is light that a surface emits, which the colour must show too. What the colour does not
+        # show is a wild value, and would be smeared over its surroundings.
+        albedos = tuple(
+            np.minimum(albedo, 1 + np.maximum(color, 0))
+            for albedo, color in zip(_planes(given, len(colors)), shown, strict=True)
+        )
+        if given.has_halves and len(colors) == 2:
+            a, b = albedos
+            bounded = Buffer(np.float32(0.5) * (a + b), a, b, given.variance)
+        else:
+            bounded = replace(given, mean=albedos[0])
+        buffers = replace(buffers, albedo=bounded)
     filtered = prefilter_features(buffers, threads)
-    shape = buffers.color.mean.shape
-    scaled: list[tuple[str, FloatImage, float]] = []
-    albedo = np.ones(shape, np.float32)
-    if filtered.albedo is not None:
-        mean = filtered.albedo.mean
-        black = mean.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
-        # Well above 1 it is light that a surface emits, which the colour must show too. What the colour does
-        # not show is a wild value, and would be smeared over its surroundings.
-        bounded = np.clip(mean, 0, 2 * np.maximum(buffers.color.mean, 1))
-        # Light must not mix with what it lights, but may be brighter by any factor.
-        brightness = np.log(np.clip(mean, 1, _BRIGHTEST_ALBEDO))
-        scaled.append(("albedo", np.clip(mean, 0, 1) + brightness, _ALBEDO_PENALTY))
-        albedo = np.where(black, np.float32(1), bounded + np.float32(_LEAST_ALBEDO))
-    if filtered.normal is not None:
-        scaled.append(("normal", np.clip(filtered.normal.mean, -1, 1), _NORMAL_PENALTY))
+    depth_scale = 1.0
     if filtered.depth is not None:
-        depth = filtered.depth.mean
-        hit = depth[depth > 0]
+        hit = filtered.depth.mean[filtered.depth.mean > 0]
+        depth_scale = float(np.median(hit)) if hit.size else 1.0
+
+    planes_of_halves = [
+        _feature_planes(filtered, half, len(colors), depth_scale) for half in range(len(colors))
+    ]
+    names = tuple(planes_of_halves[0])
+    flat = [name for name in names if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_halves)]
+    kept = tuple(name for name in names if name not in flat)
+    guidance = []
+    for half, planes in enumerate(planes_of_halves):
+        features = np.empty((*shown[half].shape[:2], len(kept)), np.float32)
+        for index, name in enumerate(kept):
+            features[:, :, index] = planes[name][0]
+        penalty = tuple(planes[name][1] for name in kept)
+        albedo = np.ones(shown[half].shape, np.float32)
+        emission = smooth_emission = np.zeros(shown[half].shape, np.float32)
+        if filtered.albedo is not None:
+            smooth = _planes(filtered.albedo, len(colors))[half]
+            black = smooth.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
+            albedo = np.where(black, np.float32(1), np.clip(smooth, 0, 1) + np.float32(_LEAST_ALBEDO))
+            emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
+            smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
+            if emission.any():
+                # The pre-filter blurs long edges of bright lights, the mean along edges their corners.
+                along = _along_edges(emission, EDGES.radius, features, penalty, threads)
+                smooth_emission = np.float32(0.5) * (smooth_emission + along)
+        left_out = {name: float(planes[name][0][0, 0]) for name in flat}
+        guidance.append(
+            Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, threads)
+        )
+    return tuple(guidance)
+
+
+def _feature_planes(
+    filtered: RenderBuffers, half: int, halves: int, depth_scale: float
+) -> dict[str, tuple[FloatImage, float]]:
+    """Every channel of a half's features, scaled, and its penalty."""
+    scaled: list[tuple[str, FloatImage, float]] = []
+    if filtered.albedo is not None:
+        albedo = _planes(filtered.albedo, halves)[half]
+        # Light must not mix with what it lights, but may be brighter by any factor.
+        brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
+        scaled.append(("albedo", np.clip(albedo, 0, 1) + brightness, _ALBEDO_PENALTY))
+    if filtered.normal is not None:
+        normal = np.clip(_planes(filtered.normal, halves)[half], -1, 1)
+        scaled.append(("normal", normal, _NORMAL_PENALTY))
+    if filtered.depth is not None:
+        depth = _planes(filtered.depth, halves)[half]
         # Bounded for any unit of length; near and far surfaces stay apart.
-        typical = np.float32(np.median(hit)) if hit.size else np.float32(1)
-        scaled.append(("depth", np.float32(_DEPTH_SCALE) * depth / (depth + typical), _DEPTH_PENALTY))
-    planes = {
+        bounded = np.float32(_DEPTH_SCALE) * depth / (depth + np.float32(depth_scale))
+        scaled.append(("depth", bounded, _DEPTH_PENALTY))
+    return {
         f"{name}.{channel}": (image[:, :, index], penalty)
         for name, image, penalty in scaled
         for index, channel in enumerate(_CHANNELS[name])
     }
-    left_out = {name: float(plane[0, 0]) for name, (plane, _) in planes.items() if np.ptp(plane) == 0}
-    names = tuple(name for name in planes if name not in left_out)
-    features = np.empty((*shape[:2], len(names)), np.float32)
-    for index, name in enumerate(names):
-        features[:, :, index] = planes[name][0]
-    return Guidance(features, names, left_out, tuple(planes[name][1] for name in names), albedo, threads)
+
+
+def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
+    """Both halves of a feature, or its mean ``count`` times."""
+    if count == 2 and feature.half_a is not None and feature.half_b is not None:
+        return feature.half_a, feature.half_b
+    return (feature.mean,) * count
 
 
 def first_pilots(
-    colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: Guidance
+    colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: tuple[Guidance, ...]
 ) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, ...], FloatImage]:
     """Return (guides, demodulated colours, guide variance) for the guided pilots.
 
     ``colors`` are the two halves, or the mean alone where there are no halves that can be trusted; then
     ``variance`` (of the mean, same shape) says how noisy it is, and its own residual does where it is None.
     """
-    irradiances = tuple(color / guidance.albedo for color in colors)
-    first = FIRST_GUIDE if guidance.penalty else FIRST_GUIDE_WITHOUT_FEATURES
-    guides = tuple(np.maximum(_regress(image, first, guidance), 0) for image in irradiances)
-    guides, noise = _guides(guides, irradiances, variance, guidance)
+    irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
+    first = FIRST_GUIDE if guidance[0].penalty else FIRST_GUIDE_WITHOUT_FEATURES
+    guides = tuple(
+        np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
+    )
+    guides, noise = _guides(guides, irradiances, variance, guidance[0])
     second = Pilot(radius=7, k=1.0)
     guides = tuple(
-        np.maximum(_regress(image, second, guidance, guide, noise), 0)
-        for image, guide in zip(irradiances, guides, strict=True)
+        np.maximum(_regress(image, second, g, guide, noise), 0)
+        for image, guide, g in zip(irradiances, guides, guidance, strict=True)
     )
-    guides, noise = _guides(guides, irradiances, variance, guidance)
+    guides, noise = _guides(guides, irradiances, variance, guidance[0])
     return guides, irradiances, noise
 
 
 def following_pilots(
-    colors: _Pair, previous: _Pair, guidance: Guidance
+    colors: _Pair, previous: _Pair, guidance: tuple[Guidance, ...]
 ) -> tuple[_Pair, _Pair, FloatImage, _Pair, _Pair]:
     """Return (guides, demodulated colours, guide variance) as `first_pilots`, at a part of its cost.
 
     ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the
     guide, filled by the first of `FOLLOWING_PILOTS`; both come with it: (..., first pilot, filled previous).
     """
-    irradiance_a, irradiance_b = (color / guidance.albedo for color in colors)
+    irradiance_a, irradiance_b = (g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     irradiances = irradiance_a, irradiance_b
     first_a, first_b = (
-        np.maximum(_regress(image, FOLLOWING_PILOTS[0], guidance), 0) * guidance.albedo
-        for image in irradiances
+        g.color(_regress(image, FOLLOWING_PILOTS[0], g))
+        for image, g in zip(irradiances, guidance, strict=True)
     )
     filled_a, filled_b = (
         np.where(np.isfinite(image), np.maximum(image, 0), first).astype(np.float32)
         for image, first in zip(previous, (first_a, first_b), strict=True)
     )
-    shown = tuple(image / guidance.albedo for image in (filled_a, filled_b))
-    (guide_a, guide_b), noise = _guides(shown, irradiances, None, guidance)
+    shown = tuple(
+        np.maximum((image - g.smooth_emission) / g.albedo, 0)
+        for image, g in zip((filled_a, filled_b), guidance, strict=True)
+    )
+    (guide_a, guide_b), noise = _guides(shown, irradiances, None, guidance[0])
     return (guide_a, guide_b), irradiances, noise, (first_a, first_b), (filled_a, filled_b)
 
 
 def pilot_images(
     pilot: Pilot,
+    colors: tuple[FloatImage, ...],
     irradiances: tuple[FloatImage, ...],
     guides: tuple[FloatImage, ...],
     guide_variance: FloatImage,
-    guidance: Guidance,
+    guidance: tuple[Guidance, ...],
 ) -> tuple[FloatImage, ...]:
     """Denoise every half by one pilot; return linear radiance, shape (height, width, 3), never negative."""
+    if pilot.along_edges:
+        return tuple(
+            _along_edges(color, pilot.radius, g.features, g.penalty, g.threads)
+            for color, g in zip(colors, guidance, strict=True)
+        )
     return tuple(
-        np.maximum(_regress(image, pilot, guidance, guide, guide_variance), 0) * guidance.albedo
-        for image, guide in zip(irradiances, guides, strict=True)
+        g.color(_regress(image, pilot, g, guide, guide_variance))
+        for image, guide, g in zip(irradiances, guides, guidance, strict=True)
+    )
+
+
+def _along_edges(
+    image: FloatImage, radius: float, features: FloatImage, penalty: tuple[float, ...], threads: int
+) -> FloatImage:
+    steepness = features * np.sqrt(np.array(penalty, np.float32))
+    return _core.smooth_along_edges(
+        np.ascontiguousarray(image), steepness, along=radius, across=_ACROSS_EDGES, threads=threads
     )
 
 

@@ -1,0 +1,58 @@
+// Images laid out for loops over rows that never ask where the image ends.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <vector>
+
+#include "core.hpp"
+
+namespace tungsten_dip {
+
+// An image's channels one after the other, [channel][y][x], with its border repeated `margin` pixels
+// outwards: no loop needs to ask where the image ends.
+class PaddedPlanes {
+  public:
+    PaddedPlanes(int channels, int height, int width, int margin)
+        : channels_(channels),
+          height_(height),
+          width_(width),
+          margin_(margin),
+          stride_(width + 2 * margin),
+          pixels_(static_cast<std::size_t>(channels) * static_cast<std::size_t>(height + 2 * margin) *
+                  static_cast<std::size_t>(stride_)) {}
+
+    PaddedPlanes(ConstImage image, int margin, int threads)
+        : PaddedPlanes(image.channels, image.height, image.width, margin) {
+        parallel_for(height_ + 2 * margin, threads, [&](int i) {
+            const int y = i - margin;
+            const int from_y = std::clamp(y, 0, height_ - 1);
+            for (int c = 0; c < channels_; ++c) {
+                float* to = row(c, y);
+                for (int x = -margin; x < width_ + margin; ++x) {
+                    to[x] = image.at(from_y, std::clamp(x, 0, width_ - 1), c);
+                }
+            }
+        });
+    }
+
+    [[nodiscard]] int channels() const { return channels_; }
+    [[nodiscard]] int height() const { return height_; }
+    [[nodiscard]] int width() const { return width_; }
+    [[nodiscard]] float* row(int c, int y) { return pixels_.data() + offset(c, y); }
+    [[nodiscard]] const float* row(int c, int y) const { return pixels_.data() + offset(c, y); }
+
+  private:
+    [[nodiscard]] std::ptrdiff_t offset(int c, int y) const {
+        return (static_cast<std::ptrdiff_t>(c) * (height_ + 2 * margin_) + y + margin_) * stride_ + margin_;
+    }
+
+    int channels_;
+    int height_;
+    int width_;
+    int margin_;
+    std::ptrdiff_t stride_;
+    std::vector<float> pixels_;
+};
+
+}  // namespace tungsten_dip

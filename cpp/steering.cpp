@@ -1,0 +1,183 @@
+// Smoothing along edges: what remains to be done where few samples saw which surface covers a pixel.
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <stdexcept>
+#include <vector>
+
+#include "core.hpp"
+#include "exp_minus.hpp"
+#include "fastest.hpp"
+#include "padded_planes.hpp"
+
+namespace tungsten_dip {
+namespace {
+
+constexpr float derivative_sigma = 0.7F;
+constexpr int derivative_radius = 3;
+constexpr float tensor_sigma = 2.0F;
+constexpr int tensor_radius = 6;
+
+// Standard deviations beyond which neighbours are not looked at.
+constexpr float reach = 2.5F;
+
+constexpr float least_trace = 1e-12F;
+
+template <int radius>
+using Kernel = std::array<float, 2 * std::size_t{radius} + 1>;
+
+template <int radius>
+Kernel<radius> gaussian(float sigma) {
+    Kernel<radius> kernel{};
+    float sum = 0;
+    for (int i = -radius; i <= radius; ++i) {
+        const float x = static_cast<float>(i) / sigma;
+        sum += kernel[static_cast<std::size_t>(i + radius)] = std::exp(-0.5F * x * x);
+    }
+    for (float& value : kernel) value /= sum;
+    return kernel;
+}
+
+template <int radius>
+Kernel<radius> gaussian_derivative(float sigma) {
+    Kernel<radius> kernel = gaussian<radius>(sigma);
+    for (int i = -radius; i <= radius; ++i) {
+        kernel[static_cast<std::size_t>(i + radius)] *= static_cast<float>(i) / (sigma * sigma);
+    }
+    return kernel;
+}
+
+// out = in, convolved with one kernel along rows and with another along columns.
+template <int radius>
+void convolve(const PaddedPlanes& in, int channel, const Kernel<radius>& along_rows,
+              const Kernel<radius>& along_columns, int threads, std::vector<float>& out) {
+    const auto width = static_cast<std::size_t>(in.width());
+    out.resize(static_cast<std::size_t>(in.height()) * width);
+    parallel_for(in.height(), threads, [&](int y) {
+        std::vector<float> columns(width + 2 * std::size_t{radius}, 0.0F);
+        for (int dy = -radius; dy <= radius; ++dy) {
+            const float weight = along_columns[static_cast<std::size_t>(dy + radius)];
+            const float* row = in.row(channel, y + dy) - radius;
+            for (std::size_t x = 0; x < columns.size(); ++x) columns[x] += weight * row[x];
+        }
+        float* to = out.data() + static_cast<std::size_t>(y) * width;
+        std::fill_n(to, width, 0.0F);
+        for (std::size_t dx = 0; dx < along_rows.size(); ++dx) {
+            for (std::size_t x = 0; x < width; ++x) to[x] += along_rows[dx] * columns[x + dx];
+        }
+    });
+}
+
+// The products of the features' gradients, summed over features and smoothed: channels xx, yy, xy (Foerstner
+// and Guelch 1987).
+PaddedPlanes structure_tensor(ConstImage features, int threads) {
+    const PaddedPlanes planes(features, derivative_radius, threads);
+    const auto smooth = gaussian<derivative_radius>(derivative_sigma);
+    const auto derivative = gaussian_derivative<derivative_radius>(derivative_sigma);
+    std::vector<float> products(static_cast<std::size_t>(features.height) *
+                                static_cast<std::size_t>(features.width) * 3);
+    std::vector<float> dx;
+    std::vector<float> dy;
+    for (int c = 0; c < features.channels; ++c) {
+        convolve<derivative_radius>(planes, c, derivative, smooth, threads, dx);
+        convolve<derivative_radius>(planes, c, smooth, derivative, threads, dy);
+        for (std::size_t i = 0; i < dx.size(); ++i) {
+            products[3 * i] += dx[i] * dx[i];
+            products[3 * i + 1] += dy[i] * dy[i];
+            products[3 * i + 2] += dx[i] * dy[i];
+        }
+    }
+    const ConstImage image{
+        .data = products.data(), .height = features.height, .width = features.width, .channels = 3};
+    const PaddedPlanes padded(image, tensor_radius, threads);
+    const auto window = gaussian<tensor_radius>(tensor_sigma);
+    PaddedPlanes tensor(3, features.height, features.width, 0);
+    std::vector<float> smoothed;
+    for (int c = 0; c < 3; ++c) {
+        convolve<tensor_radius>(padded, c, window, window, threads, smoothed);
+        std::copy(smoothed.begin(), smoothed.end(), tensor.row(c, 0));
+    }
+    return tensor;
+}
+
+// What one row's Gaussians are made of: the unit vectors across the edges, and 1 / (2 sigma^2) along them.
+struct Gaussians {
+    std::vector<float> normal_x;
+    std::vector<float> normal_y;
+    std::vector<float> along;
+
+    explicit Gaussians(std::size_t count) : normal_x(count), normal_y(count), along(count) {}
+};
+
+// Where there is no single direction, as at corners, the Gaussian shrinks to the width that it has across.
+void find_gaussians(const PaddedPlanes& tensor, int y, float along, float across, Gaussians& out) {
+    for (int x = 0; x < tensor.width(); ++x) {
+        const float xx = tensor.row(0, y)[x];
+        const float yy = tensor.row(1, y)[x];
+        const float xy = tensor.row(2, y)[x];
+        const float angle = 0.5F * std::atan2(2 * xy, xx - yy);
+        const float coherence =
+            std::sqrt((xx - yy) * (xx - yy) + 4 * xy * xy) / std::max(xx + yy, least_trace);
+        const float sigma = std::max(along * coherence * coherence, across);
+        const auto i = static_cast<std::size_t>(x);
+        out.normal_x[i] = std::cos(angle);
+        out.normal_y[i] = std::sin(angle);
+        out.along[i] = 0.5F / (sigma * sigma);
+    }
+}
+
+TUNGSTEN_DIP_FASTEST void weigh_offset(const float* normal_x, const float* normal_y, const float* along,
+                                       float dx, float dy, float across, int count, float* weights) {
+    const float across_scale = 0.5F / (across * across);
+    const float distance = dx * dx + dy * dy;
+    for (int x = 0; x < count; ++x) {
+        const float v = normal_x[x] * dx + normal_y[x] * dy;
+        weights[x] = exp_minus(std::max((distance - v * v) * along[x], 0.0F) + v * v * across_scale);
+    }
+}
+
+TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, const float* values, int count, float* sums) {
+    for (int x = 0; x < count; ++x) sums[x] += weights[x] * values[x];
+}
+
+}  // namespace
+
+void smooth_along_edges(ConstImage image, ConstImage features, float along, float across, Image out,
+                        int threads) {
+    if (!(along > 0) || !(across > 0)) throw std::invalid_argument("along and across must be above 0");
+    if (image.size() == 0) return;
+    const PaddedPlanes tensor = structure_tensor(features, threads);
+    const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
+    const PaddedPlanes planes(image, radius, threads);
+    const int width = image.width;
+    parallel_for(image.height, threads, [&](int y) {
+        const auto columns = static_cast<std::size_t>(width);
+        Gaussians gaussians(columns);
+        std::vector<float> weights(columns);
+        // Of every channel, and of the weights.
+        std::vector<std::vector<float>> sums(static_cast<std::size_t>(image.channels) + 1,
+                                             std::vector<float>(columns));
+        const std::vector<float> ones(columns, 1.0F);
+        find_gaussians(tensor, y, along, across, gaussians);
+        for (int dy = -radius; dy <= radius; ++dy) {
+            for (int dx = -radius; dx <= radius; ++dx) {
+                weigh_offset(gaussians.normal_x.data(), gaussians.normal_y.data(), gaussians.along.data(),
+                             static_cast<float>(dx), static_cast<float>(dy), across, width, weights.data());
+                for (int c = 0; c < image.channels; ++c) {
+                    add_weighted(weights.data(), planes.row(c, y + dy) + dx, width,
+                                 sums[static_cast<std::size_t>(c)].data());
+                }
+                add_weighted(weights.data(), ones.data(), width, sums.back().data());
+            }
+        }
+        for (int x = 0; x < width; ++x) {
+            for (int c = 0; c < image.channels; ++c) {
+                const auto i = static_cast<std::size_t>(x);
+                out.at(y, x, c) = sums[static_cast<std::size_t>(c)][i] / sums.back()[i];
+            }
+        }
+    });
+}
+
+}  // namespace tungsten_dip
