@@ -220,3 +220,55 @@ def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     assert _frozen_bytes(one) == _frozen_bytes(many)
     assert halves_independent(buffers, 1).correlation == halves_independent(buffers, 5).correlation
     assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
+
+
+def _half_plane(angle: float, size: int = 41) -> FloatImage:
+    """Coverage of the pixels by the half-plane whose edge runs through the middle at an angle."""
+    rows, columns = np.indices((size, size)) - size // 2
+    distance = np.cos(angle) * columns + np.sin(angle) * rows
+    return np.clip(distance + 0.5, 0, 1).astype(np.float32)[:, :, None]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 1.2, np.pi / 2, 2.5])
+def test_smoothing_along_edges_keeps_them_and_takes_their_noise(angle: float) -> None:
+    edge = _half_plane(angle)
+    noise = np.random.default_rng(4).normal(0, 0.1, edge.shape).astype(np.float32)
+    smooth = _core.smooth_along_edges(edge, edge, along=3, across=0.3)
+    inner = np.s_[8:-8, 8:-8]
+    assert np.sqrt(np.mean((smooth - edge)[inner] ** 2)) < 0.03
+    residual = _core.smooth_along_edges(edge + noise, edge, along=3, across=0.3) - smooth
+    at_edge = (edge[inner] > 0.01) & (edge[inner] < 0.99)
+    assert residual[inner][at_edge].std() < 0.06
+
+
+def test_smoothing_along_edges_leaves_corners_and_constants() -> None:
+    corner = np.zeros((31, 31, 3), np.float32)
+    corner[15:, 15:] = 5
+    smooth = _core.smooth_along_edges(corner, corner, along=3, across=0.3)
+    assert smooth[15, 15, 0] > 4
+    assert smooth[14, 14, 0] < 0.5
+    constant = np.full((9, 13, 3), 2.5, np.float32)
+    for features in (constant, corner[:9, :13].copy(), np.empty((9, 13, 0), np.float32)):
+        smooth = _core.smooth_along_edges(constant, features, along=3, across=0.3)
+        np.testing.assert_allclose(smooth, 2.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (0, 4)])
+def test_smoothing_along_edges_of_small_images(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(2).random((*size, 3), np.float32)
+    smooth = _core.smooth_along_edges(image, image, along=3, across=0.3)
+    assert smooth.shape == image.shape
+    assert np.isfinite(smooth).all()
+    if image.size:
+        assert image.min() <= smooth.min() * 1.001
+        assert smooth.max() <= image.max() * 1.001
+    one, many = (_core.smooth_along_edges(image, image, along=3, across=0.3, threads=n) for n in (1, 4))
+    assert one.tobytes() == many.tobytes()
+
+
+def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
+    image = np.ones((4, 5, 3), np.float32)
+    with pytest.raises(ValueError, match="size of the image"):
+        _core.smooth_along_edges(image, image[:3].copy(), along=3, across=0.3)
+    with pytest.raises(ValueError, match="above 0"):
+        _core.smooth_along_edges(image, image, along=0, across=0.3)

@@ -12,7 +12,7 @@ from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.pilots import guidance_from_buffers
+from tungsten_dip.fit.pilots import Guidance, guidance_of_halves
 
 pytest.importorskip("torch")
 
@@ -89,8 +89,12 @@ def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: Synthe
     brighter = Buffer(
         color.mean * scale, color.half_a * scale, color.half_b * scale, color.variance * scale**2
     )
-    plain = denoise(render.buffers, _settings())
-    scaled = denoise(render.buffers.with_quantities(color=brighter), _settings())
+    # Albedos above 1 are emitted light, in the unit of the colour.
+    albedo = render.buffers.albedo
+    assert albedo is not None
+    unlit = Buffer(**{name: np.minimum(image, 1) for name, image in albedo.planes()})
+    plain = denoise(render.buffers.with_quantities(albedo=unlit), _settings())
+    scaled = denoise(render.buffers.with_quantities(albedo=unlit, color=brighter), _settings())
     np.testing.assert_array_equal(scaled.color, plain.color * scale)
     assert scaled.estimated_relmse == plain.estimated_relmse
 
@@ -316,8 +320,15 @@ def test_inputs_stay_as_they_are(render: SyntheticRender) -> None:
             assert array.tobytes() == before[name, plane]
 
 
+def _guidance(buffers: RenderBuffers) -> tuple[Guidance, ...]:
+    half_a, half_b = buffers.color.half_a, buffers.color.half_b
+    assert half_a is not None
+    assert half_b is not None
+    return guidance_of_halves(buffers, (half_a, half_b), 1.0, 1)
+
+
 def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) -> None:
-    assert guidance_from_buffers(render.buffers, 1).features.shape == (40, 56, 7)
+    assert [guidance.features.shape for guidance in _guidance(render.buffers)] == [(40, 56, 7)] * 2
 
     def flattened(name: str, channels: list[int]) -> Buffer:
         planes = {}
@@ -329,15 +340,50 @@ def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) 
     buffers = render.buffers.with_quantities(
         albedo=flattened("albedo", [0, 1, 2]), normal=flattened("normal", [1]), depth=flattened("depth", [0])
     )
-    guidance = guidance_from_buffers(buffers, 1)
-    assert guidance.features.shape == (40, 56, 2)
-    assert len(guidance.penalty) == 2
-    assert (np.ptp(guidance.features, axis=(0, 1)) > 0).all()
+    for guidance in _guidance(buffers):
+        assert guidance.features.shape == (40, 56, 2)
+        assert len(guidance.penalty) == 2
+        assert (np.ptp(guidance.features, axis=(0, 1)) > 0).all()
     _check(denoise(buffers, _settings(iterations=2)), buffers)
     channels = {"albedo": [0, 1, 2], "normal": [0, 1, 2], "depth": [0]}
     nothing = render.buffers.with_quantities(**{name: flattened(name, of) for name, of in channels.items()})
-    assert guidance_from_buffers(nothing, 1).features.shape == (40, 56, 0)
+    assert [guidance.features.shape for guidance in _guidance(nothing)] == [(40, 56, 0)] * 2
     _check(denoise(nothing, _settings(iterations=2)), nothing)
+
+
+def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: SyntheticRender) -> None:
+    """What a half's features share with the colour that scores it would pass for truth."""
+
+    def darkened(half: str) -> RenderBuffers:
+        # Albedos half as high in one half: weights of the pre-filter hardly change, values do.
+        albedo = render.buffers.albedo
+        assert albedo is not None
+        image = getattr(albedo, half)
+        assert image is not None
+        return render.buffers.with_quantities(albedo=replace(albedo, **{half: image / 2}))
+
+    plain, changed = _guidance(render.buffers), _guidance(darkened("half_b"))
+    assert np.abs(changed[1].albedo / plain[1].albedo - 1).mean() > 0.4
+    assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.05
+
+
+def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
+    """A lamp that its albedo shows keeps its radiance, and what lies beside it stays dark."""
+    lamp = np.zeros((40, 56, 1), np.float32)
+    lamp[10:20, 15:35] = 30.0
+    color, albedo = render.buffers.color, render.buffers.albedo
+    assert albedo is not None
+
+    def lit(buffer: Buffer) -> Buffer:
+        planes = dict(buffer.planes())
+        return Buffer(**{n: image if n == "variance" else image + lamp for n, image in planes.items()})
+
+    buffers = render.buffers.with_quantities(color=lit(color), albedo=lit(albedo))
+    image = denoise(buffers, _settings(iterations=20)).color
+    np.testing.assert_allclose(image[11:19, 16:34].mean(), color.mean[11:19, 16:34].mean() + 30, rtol=0.02)
+    far = np.ones(lamp.shape[:2], bool)
+    far[8:22, 13:37] = False
+    assert np.abs(image[far].mean() / color.mean[far].mean() - 1) < 0.05
 
 
 @pytest.mark.parametrize(

@@ -504,7 +504,7 @@ def whole_metadata(value: str) -> Spoil:
     return spoil
 
 
-PILOT = '{"k": null, "radius": 1, "step": 1, "with_position": false}, '
+PILOT = '{"along_edges": false, "k": null, "radius": 1, "step": 1, "with_position": false}, '
 
 HOSTILE: list[tuple[Spoil, str]] = [
     (external, "within the file"),
