@@ -86,7 +86,7 @@ float maximum(std::array<float, 9>& values, int count) {
     return *std::max_element(values.begin(), values.begin() + count);
 }
 
-// Fills non-finite values from the finite ones around, ring by ring.
+// Fills non-finite values from the finite ones around, ring by ring; those out of reach stay as they are.
 template <typename Pick>
 void fill_from_neighbours(const Image& image, std::vector<Position> pending, const Pick& pick) {
     std::vector<float> filled;
@@ -109,7 +109,15 @@ void fill_from_neighbours(const Image& image, std::vector<Position> pending, con
         }
         pending = std::move(left);
     }
-    for (const Position at : pending) image.at(at.y, at.x, at.c) = 0;
+}
+
+// Fills what is left with the values of another image, and with 0 where that knows nothing either.
+void fill_from_other(const Image& image, const std::vector<Position>& pending, const Image& other) {
+    for (const Position at : pending) {
+        float& value = image.at(at.y, at.x, at.c);
+        if (std::isfinite(value)) continue;
+        value = other.known() && std::isfinite(other.at(at.y, at.x, at.c)) ? other.at(at.y, at.x, at.c) : 0;
+    }
 }
 
 // Sets negative values to 0, and infinite ones as well if asked to.
@@ -149,6 +157,8 @@ void mend_values(const Buffer& buffer, Quantity quantity) {
             b = other_half(a);
         } else if (mean_sane && !a_sane && b_sane && buffer.half_a.known()) {
             a = other_half(b);
+        } else if (mean_sane && buffer.has_halves() && !a_sane && !b_sane) {
+            a = b = mean;
         }
         const auto leave_to_neighbours = [&](float& value, std::vector<Position>& left) {
             if (rules.sane(value)) return;
@@ -159,9 +169,12 @@ void mend_values(const Buffer& buffer, Quantity quantity) {
         if (buffer.half_a.known()) leave_to_neighbours(a, a_left);
         if (buffer.half_b.known()) leave_to_neighbours(b, b_left);
     });
-    fill_from_neighbours(buffer.mean, std::move(mean_left), lower_median);
-    fill_from_neighbours(buffer.half_a, std::move(a_left), lower_median);
-    fill_from_neighbours(buffer.half_b, std::move(b_left), lower_median);
+    fill_from_neighbours(buffer.mean, mean_left, lower_median);
+    fill_from_neighbours(buffer.half_a, a_left, lower_median);
+    fill_from_neighbours(buffer.half_b, b_left, lower_median);
+    fill_from_other(buffer.half_a, a_left, buffer.half_b);
+    fill_from_other(buffer.half_b, b_left, buffer.half_a);
+    fill_from_other(buffer.mean, mean_left, buffer.half_a);
 }
 
 void mend_variance(const Buffer& buffer) {
@@ -189,7 +202,8 @@ void mend_variance(const Buffer& buffer) {
             left.push_back(at);
         }
     });
-    fill_from_neighbours(variance, std::move(left), maximum);
+    fill_from_neighbours(variance, left, maximum);
+    fill_from_other(variance, left, {});
 }
 
 }  // namespace

@@ -95,7 +95,30 @@ void the_sky_has_depth_0() {
     Pixels half_b(1, 1, 1, 1.0F);
     mend({.mean = beside_nan.view(), .half_a = half_a.view(), .half_b = half_b.view(), .variance = {}},
          Quantity::depth);
-    CHECK(beside_nan.at(0, 0) == 0 && half_a.at(0, 0) == 0 && half_b.at(0, 0) == 1);
+    CHECK(beside_nan.at(0, 0) == 1 && half_a.at(0, 0) == 1 && half_b.at(0, 0) == 1);
+}
+
+// Where no neighbour is sane either, what one plane knows is not lost.
+void a_sane_plane_stands_for_the_others() {
+    Pixels mean(40, 40, 3, nan);
+    Pixels half_a(40, 40, 3, inf);
+    Pixels half_b(40, 40, 3, 2.0F);
+    mend({.mean = mean.view(), .half_a = half_a.view(), .half_b = half_b.view(), .variance = {}},
+         Quantity::color);
+    CHECK(mean.at(20, 20) == 2 && half_a.at(20, 20) == 2 && half_b.at(20, 20) == 2);
+
+    Pixels known(3, 3, 1, 5.0F);
+    Pixels lost_a(3, 3, 1, 4.0F);
+    Pixels lost_b(3, 3, 1, 6.0F);
+    lost_a.at(1, 1) = nan;
+    lost_b.at(1, 1) = nan;
+    mend({.mean = known.view(), .half_a = lost_a.view(), .half_b = lost_b.view(), .variance = {}},
+         Quantity::color);
+    CHECK(known.at(1, 1) == 5 && lost_a.at(1, 1) == 5 && lost_b.at(1, 1) == 5);
+
+    Pixels nothing(40, 40, 1, nan);
+    mend(only_mean(nothing), Quantity::color);
+    CHECK(nothing.at(20, 20) == 0);
 }
 
 void variance_follows_from_the_halves() {
@@ -135,6 +158,7 @@ int main() {
     mean_and_halves_follow_from_one_another();
     lost_values_come_from_the_neighbours();
     the_sky_has_depth_0();
+    a_sane_plane_stands_for_the_others();
     variance_follows_from_the_halves();
     empty_images_are_fine();
     return failed_checks();

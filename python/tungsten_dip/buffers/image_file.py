@@ -50,7 +50,9 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         return _decoded(path)
     except InputError:
         raise
-    except (MemoryError, RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
+    except MemoryError as error:
+        raise InputError(f"{path}: not enough memory to read it ({error}); free some, or crop it") from error
+    except (RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
 
 

@@ -13,7 +13,8 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
 
     No radiance is clamped, however large. Negative values become 0 (normals may be negative), and so does
     an infinite depth (1e9 and more), which marks the sky. Everything else is rebuilt: the mean and the
-    halves from one another, a variance from the halves, and what remains from the sane pixels around it.
+    halves from one another, a variance from the halves, and what remains from the sane pixels around it or,
+    far from any, from the half that is sane.
     Arrays without defects are shared with ``buffers``, which are not modified. ``threads`` None uses every
     core.
     """

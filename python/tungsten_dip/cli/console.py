@@ -34,6 +34,14 @@ EXTRA_BY_MODULE = {
 }
 """Which optional part of the package brings a module that is not installed."""
 
+_NO_MEMORY = (
+    "t allocate memory",
+    "Cannot allocate memory",
+    "failed to map segment",
+    "error return without exception set",
+)
+"""What torch, the loader of libraries and CPython say in place of raising MemoryError."""
+
 SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 LINE_INTERVAL_S = 5.0
@@ -78,6 +86,9 @@ def run(command: str, body: Callable[[], None]) -> int:
                 f"needs {error.name}; install it with pip install 'tungsten-dip[{extra}]'",
                 EXIT_INPUT,
             )
+        if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
+            line = f"not enough memory ({str(error)[:200] or 'none left'}); free some, or denoise a smaller image"
+            return _fail(command, line, EXIT_INPUT)
         line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
         return _fail(command, line, EXIT_INTERNAL)
     return 0
