@@ -254,6 +254,7 @@ def evidence_from_buffers(
         moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
         guides, irradiances, noise, first, filled = following_pilots(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
+    something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
         late = time.perf_counter() - started > 0.7 * (settings.time_budget_s or math.inf)
@@ -261,7 +262,7 @@ def evidence_from_buffers(
             break
         if pilot not in computed:
             image_a, image_b = pilot_images(pilot, halves, irradiances, guides, noise, guidance)
-            computed[pilot] = image_a, image_b
+            computed[pilot] = image_a * something, image_b * something
         images.append(computed[pilot])
     described = described[: len(images) - 1]
     for image_a, image_b in candidates:
@@ -448,6 +449,20 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     if name in guidance.names:
         return guidance.features[:, :, guidance.names.index(name)]
     return np.full(guidance.features.shape[:2], guidance.left_out[name], np.float32)
+
+
+def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
+    """0 where no sample in the 5x5 pixels around hit anything or brought light, else 1; (height, width, 1).
+
+    Empty space is black to the eye only if it is black: what filters spread into it is seen at once.
+    """
+    if buffers.depth is None:
+        return np.ones((1, 1, 1), np.float32)
+    seen = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
+    padded = np.pad(seen, ((2, 2), (2, 2), (0, 0)))
+    height, width = seen.shape[:2]
+    near = [padded[dy : dy + height, dx : dx + width] for dy in range(5) for dx in range(5)]
+    return np.logical_or.reduce(near).astype(np.float32)
 
 
 def _scaled(image: FloatImage, scale: float) -> FloatImage:

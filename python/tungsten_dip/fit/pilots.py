@@ -321,10 +321,10 @@ def _regress(
     guide: FloatImage | None = None,
     guide_variance: FloatImage | None = None,
 ) -> FloatImage:
-    features, penalty = guidance.features, guidance.penalty
+    features, names, penalty = guidance.features, guidance.names, guidance.penalty
     if pilot.with_position:
         features = np.concatenate((features, _positions(image.shape)), axis=2)
-        penalty = (*penalty, 0.0, 0.0)
+        names, penalty = (*names, "column", "row"), (*penalty, 0.0, 0.0)
     if pilot.k is None:
         return _core.regress(
             image, features, penalty, radius=pilot.radius, step=pilot.step, threads=guidance.threads
@@ -332,7 +332,8 @@ def _regress(
     return _core.regress(
         image,
         features,
-        (0.0,) * len(penalty),
+        # A guide tells surfaces apart where they differ in light, but not dark ones from the empty space behind.
+        tuple(p if name.startswith("depth") else 0.0 for name, p in zip(names, penalty, strict=True)),
         guide,
         guide_variance,
         radius=pilot.radius,
