@@ -17,7 +17,7 @@ BUILD_FILES := pyproject.toml setup.py $(shell find CMakeLists.txt $(CXX_FOLDERS
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
-.PHONY: help demo test lint format clean
+.PHONY: help demo test stress fuzz sanitize lint format clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/\1 \2/p' Makefile | while read -r goal does; do \
@@ -32,6 +32,19 @@ test: build/dev/build.ninja ## run every test, C++ and Python
 	$(BIN)/cmake --build build/dev
 	$(BIN)/ctest --test-dir build/dev --output-on-failure
 	$(BIN)/python -m pytest
+
+stress: $(VENV)/developing ## try hard cases, kills, full disks, hostile files; PAGE=docs/hard-cases.md writes the page
+	PYTHONPATH=tests/python $(BIN)/python tests/stress $(if $(PAGE),--page $(PAGE))
+
+sanitize: $(VENV)/developing ## run the C++ tests under the address, undefined and thread sanitizers
+	for preset in asan tsan; do \
+		PATH="$(CURDIR)/$(BIN):$$PATH" cmake --preset $$preset -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python" \
+		&& $(BIN)/cmake --build --preset $$preset && $(BIN)/ctest --preset $$preset || exit 1; \
+	done
+
+fuzz: $(VENV)/developing ## let atheris search for files that break a reader; SECONDS_EACH=60 for every reader
+	$(PIP) atheris
+	PYTHONPATH=tests/python $(BIN)/python tests/fuzz --seconds $(or $(SECONDS_EACH),60)
 
 lint: build/dev/build.ninja ## check style and types of all code
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-// Finds and mends values that no renderer can have meant. Finite values are never clamped, however large.
+// Finds and mends values that no renderer can have meant. Radiance is never clamped, however large.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -11,7 +11,11 @@ namespace tungsten_dip {
 namespace {
 
 constexpr float infinite_depth = 1e9F;
-constexpr int reach = 16;  // how far a sane pixel may be from the one it mends
+constexpr float infinite_radiance = 1e36F;  // sums of some hundreds overflow
+// Squares of what is beyond these overflow.
+constexpr float infinite_normal = 1e6F;
+constexpr float infinite_albedo = 1e12F;  // which holds the radiance of lights, too
+constexpr int reach = 16;                 // how far a sane pixel may be from the one it mends
 
 struct Rules {
     bool nonnegative;
@@ -22,11 +26,24 @@ struct Rules {
     }
 };
 
-constexpr Rules variance_rules{.nonnegative = true, .infinite_from = std::numeric_limits<float>::infinity()};
-
 Rules value_rules(Quantity quantity) {
-    return {.nonnegative = quantity != Quantity::normal,
-            .infinite_from = quantity == Quantity::depth ? infinite_depth : variance_rules.infinite_from};
+    switch (quantity) {
+        case Quantity::normal:
+            return {.nonnegative = false, .infinite_from = infinite_normal};
+        case Quantity::depth:
+            return {.nonnegative = true, .infinite_from = infinite_depth};
+        case Quantity::albedo:
+        case Quantity::visibility:
+            return {.nonnegative = true, .infinite_from = infinite_albedo};
+        case Quantity::color:
+            break;
+    }
+    return {.nonnegative = true, .infinite_from = infinite_radiance};
+}
+
+Rules variance_rules(Quantity quantity) {
+    const float largest = value_rules(quantity).infinite_from;
+    return {.nonnegative = true, .infinite_from = largest * largest};
 }
 
 Defects find_defects(ConstImage image, Rules rules, int threads) {
@@ -177,12 +194,13 @@ void mend_values(const Buffer& buffer, Quantity quantity) {
     fill_from_other(buffer.mean, mean_left, buffer.half_a);
 }
 
-void mend_variance(const Buffer& buffer) {
+void mend_variance(const Buffer& buffer, Quantity quantity) {
+    const Rules rules = variance_rules(quantity);
     const Image& variance = buffer.variance;
     std::vector<Position> left;
     for_each_position(variance, [&](Position at) {
         float& value = variance.at(at.y, at.x, at.c);
-        if (variance_rules.sane(value)) return;
+        if (rules.sane(value)) return;
         value = std::numeric_limits<float>::quiet_NaN();
         if (buffer.has_halves()) {
             double sum = 0;
@@ -213,12 +231,12 @@ BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads)
     return {.mean = find_defects(buffer.mean, rules, threads),
             .half_a = find_defects(buffer.half_a, rules, threads),
             .half_b = find_defects(buffer.half_b, rules, threads),
-            .variance = find_defects(buffer.variance, variance_rules, threads)};
+            .variance = find_defects(buffer.variance, variance_rules(quantity), threads)};
 }
 
 void mend(const Buffer& buffer, Quantity quantity) {
     mend_values(buffer, quantity);
-    if (buffer.variance.known()) mend_variance(buffer);
+    if (buffer.variance.known()) mend_variance(buffer, quantity);
 }
 
 }  // namespace tungsten_dip

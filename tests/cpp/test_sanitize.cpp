@@ -121,6 +121,14 @@ void a_sane_plane_stands_for_the_others() {
     CHECK(nothing.at(20, 20) == 0);
 }
 
+void wild_normals_come_from_the_neighbours() {
+    Pixels normal(1, 3, 3, 0.6F);
+    normal.at(0, 1) = 1e19F;
+    CHECK(find_defects(only_mean(normal), Quantity::normal, 1).mean.infinite == 1);
+    mend(only_mean(normal), Quantity::normal);
+    CHECK(normal.at(0, 1) == 0.6F);
+}
+
 void variance_follows_from_the_halves() {
     Render render(3, 3, 4, 1, [](auto&) { return 0.0; });
     render.half_a.at(1, 1) = 601;
@@ -159,6 +167,7 @@ int main() {
     lost_values_come_from_the_neighbours();
     the_sky_has_depth_0();
     a_sane_plane_stands_for_the_others();
+    wild_normals_come_from_the_neighbours();
     variance_follows_from_the_halves();
     empty_images_are_fine();
     return failed_checks();
