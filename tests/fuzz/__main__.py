@@ -17,7 +17,6 @@ import atheris
 
 with atheris.instrument_imports(include=["tungsten_dip"]):
     from readers import READERS
-
     from tungsten_dip.errors import InputError
 
 MOST_BYTES = 1 << 16
@@ -61,7 +60,8 @@ def _fuzz(name: str, seconds: int) -> None:
         try:
             reader.read(path)
         except InputError as refused:
-            assert "\n" not in str(refused), "more than one line"
+            if "\n" in str(refused):
+                raise RuntimeError("more than one line") from refused
 
     limits = [f"-max_total_time={seconds}", f"-max_len={MOST_BYTES}", "-rss_limit_mb=4096", "-timeout=20"]
     output = [f"-artifact_prefix={folder}/", "-print_final_stats=1"]

@@ -79,9 +79,9 @@ class Outcome:
             broken["finite"] = "finite"
         if self.drift is not None and not abs(self.drift) <= MOST_DRIFT:
             broken["mean"] = f"mean {self.drift:+.1%}"
-        if self.error is not None and self.input_error is not None:
-            if not self.error <= max(self.input_error, INVISIBLE):
-                broken["error"] = f"error {self.error:.2g} > {self.input_error:.2g}"
+        most = None if self.input_error is None else max(self.input_error, INVISIBLE)
+        if self.error is not None and most is not None and not self.error <= most:
+            broken["error"] = f"error {self.error:.2g} > {self.input_error:.2g}"
         if self.harm is not None and not self.harm <= MOST_HARM:
             broken["harm"] = f"harm {self.harm:.2g}"
         return tuple(text for promise, text in broken.items() if promise not in case.unpromised)

@@ -1,4 +1,4 @@
-"""A fast slice of the hard cases: what is promised of ugly renders, and gradients that are those of the losses.
+"""A fast slice of the hard cases, and gradients that are those of the losses.
 
 `make stress` measures all of them, in every way.
 """

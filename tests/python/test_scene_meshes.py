@@ -1,6 +1,7 @@
 """Meshes and curves: round trips, what Tungsten does with normals, and files that lie."""
 
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -269,3 +270,15 @@ def test_damaged_curves_are_refused_in_one_line(tmp_path, name, content):
         read_curves(tmp_path / name)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_hair_that_claims_billions_of_curves_is_refused_before_anything_is_allocated(tmp_path):
+    header = b"HAIR" + struct.pack("<IIIIf", 2**32 - 2, 2**32 - 1, 2, 5, 0.1)
+    (tmp_path / "a.hair").write_bytes(header + bytes(16 + 88 + 24))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="cut off or damaged"):
+            read_curves(tmp_path / "a.hair")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()

@@ -1,4 +1,4 @@
-"""Everything that is tried to break the program: prints one table, and writes docs/hard-cases.md if asked to.
+"""Everything that is tried to break the program: prints one table, and renews docs/hard-cases.md if asked to.
 
 Run by ``make stress``; with names of parts (numerics, kills, hostile, load), runs these alone.
 """
@@ -27,7 +27,9 @@ def main() -> int:
     parser.add_argument(
         "parts", nargs="*", metavar="PART", help="numerics, kills, hostile, load (default: all)"
     )
-    parser.add_argument("--page", type=Path, help="write the catalogue with what was measured, as Markdown")
+    parser.add_argument(
+        "--page", type=Path, help="a Markdown file whose last section tells what was measured"
+    )
     options = parser.parse_args()
     logging.getLogger("tungsten_dip").setLevel(logging.CRITICAL)
 
@@ -55,7 +57,7 @@ def _numerics(destination: Path | None) -> list[Row]:
     measured = numerics.measured_cases()
     others = numerics.other_rows()
     if destination is not None:
-        destination.write_text(page.catalogue(measured, others), encoding="utf-8")
+        page.write_measured(destination, measured, others)
     return [*numerics.rows(measured), *others]
 
 

@@ -38,7 +38,7 @@ class _Watch:
     def note(self) -> None:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         self._mib.append(pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20))
-        self._descriptors.append(len(os.listdir("/proc/self/fd")))
+        self._descriptors.append(len(list(Path("/proc/self/fd").iterdir())))
 
     def row(self, what: str) -> Row:
         warm = int(WARM_UP * len(self._mib))

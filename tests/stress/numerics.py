@@ -81,7 +81,7 @@ def rows(measured: list[Measured]) -> list[Row]:
 
 
 def other_rows() -> list[Row]:
-    """Return what is tried beside the catalogue: threads, a wild learning rate, renders that a search finds."""
+    """Return what is tried beside the catalogue: threads, learning rates, what a search finds."""
     return [_threads(), _learning_rates(), _search()]
 
 

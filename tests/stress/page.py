@@ -1,41 +1,23 @@
-"""docs/hard-cases.md: every case, what is promised of it, and what was measured."""
+"""The last section of docs/hard-cases.md: every case, and what was measured."""
 
 from __future__ import annotations
 
-from hard_cases import HEIGHT, PROMISES, SPP, WIDTH
-from numerics import EXPOSURES, FEW_STEPS, PATHS, PAPER, Measured
+from pathlib import Path
+
+from numerics import Measured
 from row import Row, table
 
-_INTRODUCTION = f"""# Hard cases
-
-Renderers produce ugly data, machines die, files lie. This page lists what is tried against it, what is promised, and
-what was measured. `make stress` tries all of it and prints one table; `make stress PAGE=docs/hard-cases.md` also writes
-the tables of this page anew. `make test` holds a fast slice (`tests/python/test_hard_cases.py`).
-
-## Promises
-
-{{promises}}
-
-A promise that does not hold for a case is named beneath the table of its group, with the reason.
-
-## Numerical cases
-
-Every case (`tests/python/hard_cases.py`) damages a render of {WIDTH}x{HEIGHT} pixels at {SPP} spp whose truth is known:
-a sphere on a checkered floor before a sky. It goes through the preset draft with all its steps (twice, with one thread
-and with two, and at exposures of {" and ".join(f"2^{e}" for e in EXPOSURES)}), through balanced and final with {FEW_STEPS}
-steps, paper with {PAPER.iterations} (of which only finite values are promised), a warm start from the network of the
-undamaged render, and onnxruntime.
-
-*Error* is the relMSE of undamaged pixels, of the input and of the result of draft; *mean* how far the mean radiance
-out of reach of the damage has moved; *harm* the error there, relative to that without the damage. The last column
-names the ways ({", ".join(PATHS)}) in which all promises held, or what did not.
-"""
+_HEADING = "## Measured\n"
 
 
-def catalogue(measured: list[Measured], others: list[Row]) -> str:
-    """Return the page."""
-    promises = "\n".join(f"- **{name}**: {text}." for name, text in PROMISES.items())
-    parts = [_INTRODUCTION.format(promises=promises)]
+def write_measured(path: Path, measured: list[Measured], others: list[Row]) -> None:
+    """Replace what follows the heading "Measured" in a file."""
+    kept, heading, _ = path.read_text(encoding="utf-8").partition(_HEADING)
+    path.write_text(kept + heading + "\n" + _tables(measured, others), encoding="utf-8")
+
+
+def _tables(measured: list[Measured], others: list[Row]) -> str:
+    parts = []
     for group in dict.fromkeys(m.case.group for m in measured):
         of_group = [m for m in measured if m.case.group == group]
         lines = [f"### {group}", "", "| case | error | mean | harm | ways |", "|---|---|---|---|---|"]

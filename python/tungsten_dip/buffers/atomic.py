@@ -71,7 +71,7 @@ def _remove_left_by_the_dead(target: Path) -> None:
 
 
 def _try_to_lock(file: int) -> bool:
-    """Lock a file for as long as it is open; return whether nobody else has. Some file systems have no locks."""
+    """Lock a file for as long as it is open; return whether that was possible."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

@@ -11,7 +11,7 @@ _PLANES = ("", " half A", " half B", " variance")
 def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Mend NaN, infinite and negative values; return buffers and, for the log, a line per mended quantity.
 
-    No finite radiance (up to 1e36) is clamped. Negative values become 0 (normals may be negative), and so does an
+    No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative), and so does an
     infinite depth (1e9 and more), which marks the sky. Everything else, also normals of 1e6 and an albedo of
     1e12 and more, is rebuilt: the mean and the halves from one another, a variance from the halves, and what
     remains from the sane pixels around it or, far from any, from the half that is sane.

@@ -87,7 +87,8 @@ def run(command: str, body: Callable[[], None]) -> int:
                 EXIT_INPUT,
             )
         if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
-            line = f"not enough memory ({str(error)[:200] or 'none left'}); free some, or denoise a smaller image"
+            reason = str(error)[:200] or "none left"
+            line = f"not enough memory ({reason}); free some, or use a smaller image"
             return _fail(command, line, EXIT_INPUT)
         line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
         return _fail(command, line, EXIT_INTERNAL)

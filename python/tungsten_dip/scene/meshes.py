@@ -374,14 +374,15 @@ def _curves_from_hair(path: Path, content: bytes) -> CurveSet:
     file.take("u1", 16 + 88)
     if not present & 2:
         raise InputError(f"{path}: expected points in the file, got none; export the curves again")
-    if present & 1:
-        counts = file.take("<u2", curve_count).astype(np.int64) + 1
-    else:
+    segments = file.take("<u2", curve_count) if present & 1 else None
+    # Taken before anything is allocated: the file must be long enough for as many nodes as it claims.
+    points = file.take(("<f4", 3), node_count)
+    widths = file.take("<f4", node_count) if present & 4 else np.full(node_count, default_width, np.float32)
+    if segments is None:
         if curve_count > node_count:
             raise InputError(
                 f"{path}: expected fewer curves than nodes, got {curve_count}; export the curves again"
             )
-        counts = np.full(curve_count, default_segments + 1, np.int64)
-    points = file.take(("<f4", 3), node_count)
-    widths = file.take("<f4", node_count) if present & 4 else np.full(node_count, default_width, np.float32)
+        segments = np.full(curve_count, default_segments)
+    counts = segments.astype(np.int64) + 1
     return CurveSet(np.column_stack([points, widths]).astype(np.float32), np.cumsum(counts))
