@@ -590,6 +590,15 @@ def test_files_that_are_no_models(tmp_path: Path, saved: Path) -> None:
         load_model(tmp_path)
 
 
+@pytest.mark.parametrize("name", [b"layer1.weight", b"tungsten_dip", b"Conv", b"inputs"])
+def test_names_that_are_no_text_are_refused(name: bytes, saved: Path) -> None:
+    content = saved.read_bytes()
+    assert name in content
+    saved.write_bytes(content.replace(name, b"\xff" + name[1:]))
+    with pytest.raises(InputError):
+        load_model(saved)
+
+
 def test_nested_graphs_do_not_exhaust_the_stack(model: Model, tmp_path: Path) -> None:
     content = b""
     for _ in range(5000):  # attribute { g: graph { node { attribute ...

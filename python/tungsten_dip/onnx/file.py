@@ -112,7 +112,10 @@ def _model_from_bytes(content: bytes) -> Model:
     except (DecodeError, RecursionError):
         raise InputError(_NO_ONNX) from None
     facts = _facts(proto)
-    model = _model_from_facts(facts, {t.name: t for t in proto.graph.initializer})
+    tensors = {tensor.name: tensor for tensor in proto.graph.initializer}
+    if not all(isinstance(name, str) for name in tensors):  # bytes are what is no UTF-8
+        raise InputError("expected weights with names in UTF-8; this is no model of tungsten-dip")
+    model = _model_from_facts(facts, tensors)
     _check_same(proto, proto_from_model(model))
     return model
 
