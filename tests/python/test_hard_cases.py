@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
+from conftest import synthetic_render
 from hard_cases import CASES, HardCase, broken_renders, exposed, healthy, measure
-from tungsten_dip.buffers import RenderBuffers
+from tungsten_dip.buffers import RenderBuffers, prefilter_features, sanitize
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.onnx import infer
 
@@ -188,3 +189,11 @@ def _check_gradient(parameter, gradient, loss: Callable[[], float], entries: int
         values[place] = known
         expected = (losses[0] - losses[1]) / (2 * step)
         assert float(flat[index]) == pytest.approx(expected, rel=1e-4, abs=1e-4 * float(flat.abs().max()))
+
+
+def test_a_depth_around_0_does_not_fall_below_it() -> None:
+    buffers = synthetic_render(3, 2, 4).buffers.with_quantities(albedo=None, normal=None)
+    depth = prefilter_features(sanitize(buffers)[0]).depth
+    assert depth is not None
+    assert depth.mean.min() >= 0
+    assert np.isfinite(denoise(buffers, replace(DRAFT, iterations=2)).color).all()

@@ -21,6 +21,7 @@ from tungsten_dip.onnx import load_model
 
 KILLS = 50
 KILLS_BETWEEN_WHOLE_RUNS = 6
+KILLS_BETWEEN_EMPTYING = 2
 
 _SCENE = {
     "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
@@ -151,12 +152,12 @@ def _row(command: Command, folder: Path, kills: int, rng: random.Random) -> Row:
     lost: list[str] = []
     hits = most_left = 0
     for number in range(kills):
-        if number % KILLS_BETWEEN_WHOLE_RUNS == 0:
+        if number % KILLS_BETWEEN_EMPTYING == 0:
             for path in out.iterdir():
                 path.unlink()
-        # Every other kill hits while files are being written, which is a small part of a run.
+        # Every other kill hits while files are written, mostly soon after the first.
         while_writing = number % 2 == 1
-        delay = 0.9 * rng.uniform(0, writing_seconds if while_writing else seconds)
+        delay = writing_seconds * rng.random() ** 4 if while_writing else 0.9 * seconds * rng.random()
         hits += _killed(command, folder, delay, while_writing)
         most_left = max(most_left, len(temporary_files(out)))
         lost += [f"{name} is not whole after kill {number}" for name in unreadable(out)]

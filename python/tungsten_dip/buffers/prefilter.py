@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import FEATURES, Buffer, RenderBuffers
 
@@ -18,9 +20,11 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     for name in FEATURES:
         feature: Buffer | None = getattr(buffers, name)
         if feature is not None and feature.half_a is not None and feature.half_b is not None:
-            filtered[name] = Buffer(
-                *_core.prefilter_feature(
-                    feature.mean, feature.half_a, feature.half_b, feature.variance, threads or 0
-                )
+            mean, *others = _core.prefilter_feature(
+                feature.mean, feature.half_a, feature.half_b, feature.variance, threads or 0
             )
+            if name != "normal":
+                # Where negative values were mended, the mean is not that of the halves, and may fall below 0.
+                np.maximum(mean, 0, out=mean)
+            filtered[name] = Buffer(mean, *others)
     return buffers.with_quantities(**filtered)
