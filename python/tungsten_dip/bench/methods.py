@@ -146,6 +146,9 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool
         for preset in plan.presets:
             settings = FitSettings(preset, threads=plan.threads)
             yield _ours(bench_set, OURS, preset, preset, settings, pictured=True)
+        if has_oidn:
+            guided = FitSettings("final", pilot="oidn", threads=plan.threads)
+            yield _ours(bench_set, OURS, "final, with OIDN as a pilot", "with OIDN", guided, pictured=True)
     if "budgets" in plan.kinds:
         for budget_s in plan.budgets_s:
             settings = FitSettings("final", time_budget_s=budget_s, threads=plan.threads)

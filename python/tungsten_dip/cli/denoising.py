@@ -15,7 +15,7 @@ from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
 from tungsten_dip.report.page import report_page
 
-FIT_OPTIONS = ("preset", "time_budget_s", "target_error", "device")
+FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
 
 REPORT_HELP = "write a page with the pictures, the error and what led to them"
@@ -26,6 +26,8 @@ def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
     add, flag = parser.add_argument, f"--{prefix}"
     devices = get_args(get_type_hints(FitSettings)["device"])
     add(f"{flag}preset", dest="preset", choices=get_args(Preset), help="how to fit (default: balanced)")
+    pilots = get_args(get_type_hints(FitSettings)["pilot"])
+    add(f"{flag}pilot", dest="pilot", choices=pilots, help="another denoiser to choose from (default: none)")
     add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=duration, help="end after 90s, 5m, ...")
     add(f"{flag}target-error", dest="target_error", metavar="E", type=float, help="end at this relMSE")
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")

@@ -12,6 +12,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import checked_candidates, checked_previous
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
 
@@ -62,6 +63,8 @@ def denoise(
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     require_torch()
+    if settings.pilot == "oidn":
+        require_oidn()
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, settings.threads)

@@ -23,6 +23,7 @@ from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
+from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
     FOLLOWING_PILOTS,
     Guidance,
@@ -36,6 +37,7 @@ from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
 Array = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.int64]
 
 Halves = tuple[FloatImage, FloatImage]
 """An image made of half A of the samples alone, and one made of half B alone; shape (height, width, 3)."""
@@ -66,6 +68,13 @@ _LEAST_NOISE = 1.0
 _LEAST_SPREAD = 1e-6
 LARGEST_INPUT = 4.0
 _ERROR_RADIUS = 4
+_BIAS = 2.0
+"""What the squared bias is to the median squared difference of the pilots from the result, about."""
+
+_CONFIDENCE = 4.0
+"""Standard errors above what the halves tell that an estimated error is believed."""
+
+_CHUNK_PIXELS = 1 << 18
 _SURE = 0.35
 """Relative standard error of an estimated relMSE up to which it is believed."""
 
@@ -224,7 +233,7 @@ def evidence_from_buffers(
             image = color.mean.copy()
         else:
             notes.append(_why_no_halves(buffers, test))
-            if candidates or previous is not None:
+            if candidates or previous is not None or settings.pilot != "none":
                 notes.append("the candidates are not used: nothing can score them")
             colors = (_scaled(color.mean, scale),)
             guidance = guidance_of_halves(buffers, colors, scale, threads)
@@ -244,6 +253,9 @@ def evidence_from_buffers(
         mean = np.float32(0.5) * (halves[0] + halves[1])
     guidance = guidance_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
+    if settings.pilot == "oidn":
+        candidates = (*candidates, _oidn_halves(buffers, halves, scale, settings.threads))
+        progress(0.15, "Open Image Denoise")
     if layout is not None:
         _check_fits(layout, guidance[0], len(candidates) + (previous is not None))
     images: list[Halves] = [halves]
@@ -362,31 +374,68 @@ def standardisation_of(inputs: Array) -> Standardisation:
     return Standardisation(mean, std)
 
 
-def witnesses(evidence: Evidence) -> list[tuple[Array, Array]]:
-    """The noisy halves and, far less noisy but a little blurred, the smallest pilot; shape (pixels, 3)."""
-    return [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in evidence.pilots[:2]]
-
-
 def estimate_error(
-    fused_a: Array, fused_b: Array, witnesses: list[tuple[Array, Array]]
-) -> tuple[Array, Array, float]:
-    """Estimate the squared error of f = (fused_a + fused_b) / 2, relative to f^2 + epsilon.
+    evidence: Evidence, fused_a: Array, fused_b: Array, pixels: Indices | slice = slice(None)
+) -> Array:
+    """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
 
-    Arrays have shape (pixels, 3). Returns, per pixel, the unbiased estimate and the part of it that is noise,
-    and their mean over all pixels. With independent witnesses a, b of truth x and outputs f_a, f_b made of
-    one half each, E (f_a - b)^2 is the error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E
-    (f_a - f_b)^2 / 2 the variance of one output; the mean of two has half of that. The first witnesses that
-    leave the mean a small standard error are believed.
+    ``fused_a`` and ``fused_b`` are outputs made of one half each at ``pixels``, shape (pixels, 3), in the
+    units of the evidence; 0.01 is in the renderer's. The variance of f is (fused_a - fused_b)^2 / 4 in the
+    mean. Its bias is not known; it is taken for `_BIAS` times the median squared difference of f and the
+    pilots, which blur in different ways. If the mean of that is more than the noisy halves allow (see
+    `held_out_error`), all is scaled down.
     """
-    denominator = ((fused_a + fused_b) / 2) ** 2 + np.float32(RELMSE_EPSILON)
-    noise = (((fused_a - fused_b) ** 2 / 4) / denominator).mean(axis=1)
-    for half_a, half_b in witnesses:
-        crossed = (fused_a - half_b) ** 2 + (fused_b - half_a) ** 2 - (half_a - half_b) ** 2
-        unbiased = (crossed / 2 / denominator).mean(axis=1) - noise
-        mean = float(unbiased.mean(dtype=np.float64))
-        if float(unbiased.std(dtype=np.float64)) < _SURE * mean * math.sqrt(unbiased.size):
+    output = np.float32(0.5) * (fused_a + fused_b)
+    epsilon = np.float32(RELMSE_EPSILON * evidence.scale**2)
+    squared = (fused_a - fused_b) ** 2 / 4
+    error = np.empty(len(output), np.float32)
+    pilots = [(a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots[1:]]
+    for first in range(0, len(output), _CHUNK_PIXELS):
+        part = slice(first, first + _CHUNK_PIXELS)
+        relative = 1 / (output[part] ** 2 + epsilon)
+        apart = [
+            (((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2) * relative).mean(axis=1)
+            for a, b in pilots
+        ]
+        variance = (squared[part] * relative).mean(axis=1)
+        error[part] = variance + np.float32(_BIAS) * np.median(apart, axis=0)
+    told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
+    mean = float(error.mean(dtype=np.float64))
+    return error * np.float32(min(1.0, max(told + _CONFIDENCE * standard_error, 0.0) / max(mean, 1e-30)))
+
+
+def held_out_error(
+    evidence: Evidence, fused_a: Array, fused_b: Array, pixels: Indices | slice = slice(None)
+) -> float:
+    """Return the mean of the same error as the other half tells it: without bias, but noisy.
+
+    Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
+    exposure. Told by the noisy halves or, where those leave too large a standard error, by the smallest
+    pilot, far less noisy but a little blurred.
+    """
+    epsilon = np.float32(RELMSE_EPSILON)
+    for witnesses in evidence.pilots[:2]:
+        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, pixels, epsilon)
+        if standard_error < _SURE * mean:
             break
-    return unbiased, noise, max(mean, float(noise.mean(dtype=np.float64)))
+    relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
+    return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
+
+
+def _told_by_halves(
+    witnesses: Halves, fused_a: Array, fused_b: Array, pixels: Indices | slice, epsilon: np.float32
+) -> tuple[float, float]:
+    """Return the mean error that independent witnesses tell, and its standard error.
+
+    With witnesses a, b of truth x and outputs f_a, f_b made of one half each, E (f_a - b)^2 is the error of
+    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of one
+    output; the mean of two has half of that.
+    """
+    a, b = (image.reshape(-1, 3)[pixels] for image in witnesses)
+    crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
+    error = (crossed / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)).mean(axis=1)
+    spread = float(error.std(dtype=np.float64))
+    return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
 
 
 def result_from_fused(
@@ -402,29 +451,27 @@ def result_from_fused(
     threads = evidence.guidance[0].threads
     shape = fused[0].shape
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
-    unbiased, spread, estimate = estimate_error(fused_a, fused_b, witnesses(evidence))
-    # Pixel by pixel the unbiased estimate is mostly noise. Its local mean tells where it is large, and the
-    # halves' difference, which has little noise, is the least that it can be.
-    maps = [_core.box_mean(e.reshape(*shape[:2], 1), _ERROR_RADIUS, threads) for e in (unbiased, spread)]
-    image, error = np.float32(0.5) * (fused[0] + fused[1]), np.maximum(*maps)
+    image = np.float32(0.5) * (fused[0] + fused[1])
+    error = estimate_error(evidence, fused_a, fused_b).reshape(*shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
-    noise_of_input = (half_a - half_b) ** 2 / 4 / (image**2 + np.float32(RELMSE_EPSILON))
-    error_of_input = float(noise_of_input.mean(dtype=np.float64))
+    squared = (half_a - half_b) ** 2 / 4
+    error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
-    if estimate >= error_of_input:
+    if held_out_error(evidence, fused_a, fused_b) >= error_of_input:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
-        image, fused, estimate = evidence.mean, evidence.halves, error_of_input
-        error = _core.box_mean(noise_of_input.mean(axis=2, keepdims=True), _ERROR_RADIUS, threads)
+        image, fused = evidence.mean, evidence.halves
+        epsilon = np.float32(RELMSE_EPSILON * evidence.scale**2)
+        error = (squared / (image**2 + epsilon)).mean(axis=2, keepdims=True)
     unscale = np.float32(evidence.scale)
     return FitResult(
         color=image / unscale,
         settings=settings,
         seconds=time.perf_counter() - started,
         iterations=iterations,
-        error=error,
-        estimated_relmse=estimate,
+        error=_core.box_mean(error, _ERROR_RADIUS, threads),
+        estimated_relmse=float(error.mean(dtype=np.float64)),
         halves=(fused[0] / unscale, fused[1] / unscale),
         history=tuple(history),
         notes=tuple(notes),
@@ -451,6 +498,28 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     return np.full(guidance.features.shape[:2], guidance.left_out[name], np.float32)
 
 
+def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: int | None) -> Halves:
+    """What Open Image Denoise makes of each half, from the features of that half alone."""
+
+    def of_half(feature: Buffer | None, half: int) -> FloatImage | None:
+        if feature is None:
+            return None
+        if feature.half_a is None or feature.half_b is None:
+            return feature.mean
+        return (feature.half_a, feature.half_b)[half]
+
+    a, b = (
+        oidn_image(
+            halves[half] / np.float32(scale),
+            of_half(buffers.albedo, half),
+            of_half(buffers.normal, half),
+            threads=threads,
+        )
+        for half in (0, 1)
+    )
+    return a, b
+
+
 def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
     """0 where no sample in the 5x5 pixels around hit anything or brought light, else 1; (height, width, 1).
 
@@ -462,7 +531,8 @@ def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
     padded = np.pad(seen, ((2, 2), (2, 2), (0, 0)))
     height, width = seen.shape[:2]
     near = [padded[dy : dy + height, dx : dx + width] for dy in range(5) for dx in range(5)]
-    return np.logical_or.reduce(near).astype(np.float32)
+    something: FloatImage = np.logical_or.reduce(near).astype(np.float32)
+    return something
 
 
 def _scaled(image: FloatImage, scale: float) -> FloatImage:

@@ -20,6 +20,7 @@ from tungsten_dip.fit.device import compute_device
 from tungsten_dip.fit.evidence import (
     Array,
     Halves,
+    Indices,
     evidence_from_buffers,
     result_from_fused,
     standardisation_of,
@@ -32,7 +33,6 @@ from tungsten_dip.fit.training import (
     ADAM_EPSILON,
     LEAKY_SLOPE,
     Examples,
-    Indices,
     examples_from_evidence,
     first_weights,
     train,

@@ -53,7 +53,7 @@ def source_sha256(buffers: RenderBuffers) -> str:
 
 def check_settings(model: Model, settings: FitSettings) -> None:
     """Raise InputError that names the difference if the settings ask for another network than the model's."""
-    names = ("preset", *(PAPER_SETTINGS if settings.preset == "paper" else ()))
+    names = ("preset", "pilot", *(PAPER_SETTINGS if settings.preset == "paper" else ()))
     for name in names:
         expected, asked = getattr(model.settings, name), getattr(settings, name)
         if asked != expected:

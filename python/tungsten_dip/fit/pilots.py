@@ -73,18 +73,25 @@ EDGES = Pilot(3, along_edges=True)
 
 # In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
 # shadows and reflections, which no feature shows; a regression on the position follows gradients.
-DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(5), Pilot(5, k=1.0))
+DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
 BALANCED_PILOTS = (
     Pilot(1),
     EDGES,
     Pilot(5),
     Pilot(12, step=2, with_position=True),
     Pilot(4, k=1.0),
-    Pilot(9, k=1.0),
-    Pilot(9, k=2.0, with_position=True),
+    Pilot(10, k=1.0, step=2),
+    Pilot(10, k=2.0, step=2, with_position=True),
     Pilot(18, k=1.5, step=2, with_position=True),
 )
-FINAL_PILOTS = (*BALANCED_PILOTS, Pilot(2, k=1.0), Pilot(9, k=0.5), Pilot(9, k=1.0, with_position=True))
+FINAL_PILOTS = (
+    *BALANCED_PILOTS,
+    Pilot(2, k=1.0),
+    Pilot(5, k=0.5),
+    Pilot(10, k=0.5, step=2),
+    Pilot(10, k=1.0, step=2, with_position=True),
+    Pilot(24, k=1.0, step=3, with_position=True),
+)
 
 FOLLOWING_PILOTS = (Pilot(2), Pilot(5, k=2.0))
 """Enough beside what the previous frame shows. The first stands where that shows nothing."""
@@ -234,7 +241,7 @@ def first_pilots(
         np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
     )
     guides, noise = _guides(guides, irradiances, variance, guidance[0])
-    second = Pilot(radius=7, k=1.0)
+    second = Pilot(radius=8, k=1.0, step=2)
     guides = tuple(
         np.maximum(_regress(image, second, g, guide, noise), 0)
         for image, guide, g in zip(irradiances, guides, guidance, strict=True)
@@ -332,7 +339,7 @@ def _regress(
     return _core.regress(
         image,
         features,
-        # A guide tells surfaces apart where they differ in light, but not dark ones from the empty space behind.
+        # A guide tells what differs in light apart, but not dark surfaces from the empty space behind.
         tuple(p if name.startswith("depth") else 0.0 for name, p in zip(names, penalty, strict=True)),
         guide,
         guide_variance,

@@ -22,8 +22,10 @@ PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 class FitSettings:
     """Settings of one fit. None means: as the preset has it.
 
-    ``network``, ``inputs``, ``scheme`` and ``channels`` describe the network of the published method and are
-    used by the preset ``paper`` alone. ``target_error`` is a relMSE (epsilon 0.01). ``threads`` None uses
+    ``pilot`` names a denoiser that somebody else trained, as one more guess that the halves judge like the
+    others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and ``channels``
+    describe the network of the published method and are used by the preset ``paper`` alone. ``target_error``
+    is a relMSE (epsilon 0.01). ``threads`` None uses
     every core.
 
     Raises InputError if a number is out of its range.
@@ -40,6 +42,7 @@ class FitSettings:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
     threads: int | None = None
+    pilot: Literal["none", "oidn"] = "none"
 
     def __post_init__(self) -> None:
         for name in ("iterations", "time_budget_s", "target_error", "threads"):

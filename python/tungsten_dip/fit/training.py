@@ -10,23 +10,21 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip.fit.evidence import (
     Array,
     Evidence,
+    Indices,
     Layout,
     Standardisation,
     estimate_error,
+    held_out_error,
     loss_weights,
     network_inputs,
-    witnesses,
 )
 from tungsten_dip.fit.model import Weights
 from tungsten_dip.fit.settings import FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
-
-Indices = npt.NDArray[np.int64]
 
 HIDDEN = 16
 LEAKY_SLOPE = 0.2
@@ -146,17 +144,17 @@ def train(
     order = rng.permutation(pixels)
     held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
     probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
-    told = [(a[probe], b[probe]) for a, b in witnesses(evidence)]
     done = Training()
 
-    def estimate(step: int) -> float:
+    def estimate(step: int) -> tuple[float, float]:
+        """Return the error, and what the other half says of it."""
         fused_a, fused_b = (network.fuse(half, probe) for half in (0, 1))
-        error = estimate_error(fused_a, fused_b, told)[2]
+        error = float(estimate_error(evidence, fused_a, fused_b, probe).mean(dtype=np.float64))
         done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
-        return error
+        return error, held_out_error(evidence, fused_a, fused_b, probe)
 
     every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
-    best, best_weights, since_best = (estimate(0), network.weights(), 0) if warm else (math.inf, {}, 0)
+    best, best_weights, since_best = (estimate(0)[1], network.weights(), 0) if warm else (math.inf, {}, 0)
     try:
         for step in range(1, steps + 1):
             rate = min(1.0, step / _WARM_UP_STEPS)
@@ -166,12 +164,12 @@ def train(
             done.steps_done = step
             if step % every != 0 and step != steps and step != 1:
                 continue
-            error = estimate(step)
+            error, told = estimate(step)
             progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
             if warm:
-                since_best = 0 if error < (1 - _WARM_GAIN) * best else since_best + 1
-                if error < best:
-                    best, best_weights = error, network.weights()
+                since_best = 0 if told < (1 - _WARM_GAIN) * best else since_best + 1
+                if told < best:
+                    best, best_weights = told, network.weights()
             if error <= (settings.target_error or -math.inf):
                 done.notes.append(f"stopped at step {step}: the target error is reached")
                 break

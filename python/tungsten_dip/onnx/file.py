@@ -37,7 +37,7 @@ _FORMAT = 1
 """Raised whenever another graph is written."""
 
 _PROPERTY = "tungsten_dip"
-_SETTINGS = ("preset", "iterations", "network", "inputs", "scheme", "channels", "seed")
+_SETTINGS = ("preset", "pilot", "iterations", "network", "inputs", "scheme", "channels", "seed")
 """The settings that say what a network is; the others say where and how long it was fitted."""
 
 _NO_ONNX = "expected an ONNX model, this is none or cut short; save it anew with --save-model"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import onnx
 
-from tungsten_dip.fit.evidence import Array
+from tungsten_dip.fit.evidence import Array, Indices
 from tungsten_dip.fit.model import Weights
 from tungsten_dip.fit.training import (
     ADAM_BETAS,
@@ -18,7 +18,6 @@ from tungsten_dip.fit.training import (
     HIDDEN,
     LEAKY_SLOPE,
     Examples,
-    Indices,
 )
 from tungsten_dip.onnx.builder import GraphBuilder
 from tungsten_dip.onnx.sessions import session_from_proto
