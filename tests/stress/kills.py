@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,15 +135,16 @@ def temporary_files(folder: Path) -> list[str]:
 
 
 def rows(folder: Path, kills: int = KILLS, seed: int = 0) -> list[Row]:
-    """Kill every command its share of times."""
-    rng = random.Random(seed)
-    share = kills // len(COMMANDS)
-    counts = [share + (index < kills - share * len(COMMANDS)) for index in range(len(COMMANDS))]
-    found = []
-    for command, count in zip(COMMANDS, counts, strict=True):
-        (folder / command.name).mkdir()
-        found.append(_row(command, folder / command.name, count, rng))
-    return found
+    """Kill every command its share of times, two commands at once."""
+
+    def row(index: int) -> Row:
+        own = folder / COMMANDS[index].name
+        own.mkdir()
+        count = kills // len(COMMANDS) + (index < kills % len(COMMANDS))
+        return _row(COMMANDS[index], own, count, random.Random(seed + index))
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(row, range(len(COMMANDS))))
 
 
 def _row(command: Command, folder: Path, kills: int, rng: random.Random) -> Row:
