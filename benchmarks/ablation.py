@@ -1,0 +1,78 @@
+"""What each part of the preset balanced gives: PSNR, relMSE, FLIP and seconds without it.
+
+    python benchmarks/ablation.py renders/cornell-box/n4=renders/cornell-box/reference.exr ...
+
+prints a Markdown table, one row per variant. Run it on a machine with nothing else to do.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+from tungsten_dip.bench.sets import read_sets
+from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
+from tungsten_dip.report.metrics import compare
+
+Change = Callable[[], object]
+
+
+def _without(unwanted: Callable[[pilots.Pilot], bool]) -> Change:
+    preset = fusion._PRESETS["balanced"]
+    kept = tuple(pilot for pilot in preset.pilots if not unwanted(pilot))
+    return lambda: mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=kept))
+
+
+def _with_one_pilot() -> object:
+    preset = fusion._PRESETS["balanced"]
+    return mock.patch.dict(
+        fusion._PRESETS, balanced=replace(preset, pilots=(pilots.Pilot(10, k=1.0, step=2),))
+    )
+
+
+VARIANTS: dict[str, Change] = {
+    "balanced": lambda: mock.patch.dict(fusion._PRESETS),
+    "hardly trained (1 step)": lambda: mock.patch.object(
+        fusion, "_PRESETS", {"balanced": replace(fusion._PRESETS["balanced"], steps=1)}
+    ),
+    "one pilot and the noisy image": _with_one_pilot,
+    "no guided pilots": _without(lambda pilot: pilot.k is not None),
+    "guided pilots alone": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
+    "no regression on the position": _without(lambda pilot: pilot.with_position),
+    "no mean along edges as a pilot": _without(lambda pilot: pilot.along_edges),
+    "emitted light not smoothed along edges": lambda: mock.patch.object(
+        pilots, "_along_edges", lambda image, *_: image
+    ),
+    "empty space like any other": lambda: mock.patch.object(evidence, "_something", return_value=1),
+}
+
+
+def main() -> None:
+    """Measure every variant on every set, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sets", metavar="SET=REFERENCE", nargs="+")
+    parser.add_argument("--threads", type=int)
+    options = parser.parse_args()
+    sets = read_sets(options.sets)
+    print("| variant |", *(f"{Path(s.name)} |" for s in sets), "seconds |")
+    print("|---|" + "---|" * (len(sets) + 1))
+    settings = FitSettings(threads=options.threads)
+    denoise(sets[0].buffers, replace(settings, iterations=1))
+    for name, change in VARIANTS.items():
+        cells, seconds = [], 0.0
+        for bench_set in sets:
+            with change():  # type: ignore[attr-defined]
+                start = time.perf_counter()
+                result = denoise(bench_set.buffers, settings)
+                seconds += time.perf_counter() - start
+            found = compare(result.color, bench_set.reference)
+            cells.append(f"{found.psnr:.2f} / {found.relmse:.4f} / {found.flip:.4f} |")
+        print(f"| {name} |", *cells, f"{seconds / len(sets):.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
