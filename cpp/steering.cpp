@@ -31,9 +31,9 @@ template <int radius>
 Kernel<radius> gaussian(float sigma) {
     Kernel<radius> kernel{};
     float sum = 0;
-    for (int i = -radius; i <= radius; ++i) {
-        const float x = static_cast<float>(i) / sigma;
-        sum += kernel[static_cast<std::size_t>(i + radius)] = std::exp(-0.5F * x * x);
+    for (std::size_t i = 0; i < kernel.size(); ++i) {
+        const float x = (static_cast<float>(i) - radius) / sigma;
+        sum += kernel[i] = std::exp(-0.5F * x * x);
     }
     for (float& value : kernel) value /= sum;
     return kernel;
@@ -42,8 +42,8 @@ Kernel<radius> gaussian(float sigma) {
 template <int radius>
 Kernel<radius> gaussian_derivative(float sigma) {
     Kernel<radius> kernel = gaussian<radius>(sigma);
-    for (int i = -radius; i <= radius; ++i) {
-        kernel[static_cast<std::size_t>(i + radius)] *= static_cast<float>(i) / (sigma * sigma);
+    for (std::size_t i = 0; i < kernel.size(); ++i) {
+        kernel[i] *= (static_cast<float>(i) - radius) / (sigma * sigma);
     }
     return kernel;
 }
@@ -56,9 +56,9 @@ void convolve(const PaddedPlanes& in, int channel, const Kernel<radius>& along_r
     out.resize(static_cast<std::size_t>(in.height()) * width);
     parallel_for(in.height(), threads, [&](int y) {
         std::vector<float> columns(width + 2 * std::size_t{radius}, 0.0F);
-        for (int dy = -radius; dy <= radius; ++dy) {
-            const float weight = along_columns[static_cast<std::size_t>(dy + radius)];
-            const float* row = in.row(channel, y + dy) - radius;
+        int from = y - radius;
+        for (const float weight : along_columns) {
+            const float* row = in.row(channel, from++) - radius;
             for (std::size_t x = 0; x < columns.size(); ++x) columns[x] += weight * row[x];
         }
         float* to = out.data() + static_cast<std::size_t>(y) * width;
@@ -96,7 +96,7 @@ PaddedPlanes structure_tensor(ConstImage features, int threads) {
     std::vector<float> smoothed;
     for (int c = 0; c < 3; ++c) {
         convolve<tensor_radius>(padded, c, window, window, threads, smoothed);
-        std::copy(smoothed.begin(), smoothed.end(), tensor.row(c, 0));
+        std::ranges::copy(smoothed, tensor.row(c, 0));
     }
     return tensor;
 }
