@@ -104,7 +104,8 @@ def _measured(index: int) -> tuple[Outcome, dict[str, tuple[str, ...]]]:
         return drafts[0]
 
     def onnx() -> FitResult:
-        return infer(drafts[0].model or _healthy(DRAFT).model, damaged.buffers, threads=1)
+        own = drafts[0].model if drafts else None
+        return infer(own or _healthy(DRAFT).model, damaged.buffers, threads=1)
 
     ways: dict[str, Callable[[], FitResult]] = {
         "draft": draft,
@@ -139,7 +140,7 @@ def _measured(index: int) -> tuple[Outcome, dict[str, tuple[str, ...]]]:
             found += _repeated(case, damaged, result)
         elif path == "paper":  # clips highlights, and has had no time to learn anything
             found = tuple(text for text in found if text == "finite")
-        elif path == "onnxruntime" and drafts[0].model is not None:
+        elif path == "onnxruntime" and drafts and drafts[0].model is not None:
             found += () if _close(result.color, drafts[0].color) else ("differs from torch",)
         broken[path] = found
     return drafted, broken
