@@ -103,6 +103,18 @@ def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: Synthe
     assert (scaled.estimated_relmse > plain.estimated_relmse) == (exponent > 0)
 
 
+def test_dark_images_are_not_taken_for_clean_ones(render: SyntheticRender) -> None:
+    """Without halves to trust, the exposure changes nothing either."""
+    color, scale = render.buffers.color, np.float32(2.0**-21)
+    noise = (color.mean - render.reference) / 2
+    a, b = color.mean + noise, color.mean + noise / 2
+    images = [
+        denoise(RenderBuffers(Buffer((a + b) / 2 * s, a * s, b * s)), _settings()).color for s in (1, scale)
+    ]
+    assert np.abs(images[0] / ((a + b) / 2) - 1).max() > 0.1
+    np.testing.assert_array_equal(images[1], images[0] * scale)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 5), (33, 17)])
 @pytest.mark.parametrize("halves", [True, False])
 def test_any_size(size: tuple[int, int], halves: bool, make_render: MakeRender) -> None:

@@ -228,7 +228,7 @@ def evidence_from_buffers(
 
     test = halves_independent(buffers, settings.threads)
     if color.half_a is None or color.half_b is None or not test.independent:
-        if _converged(color):
+        if _converged(color, scale):
             notes.append("the halves agree to within a few thousandths: the image is returned as it is")
             image = color.mean.copy()
         else:
@@ -301,10 +301,11 @@ def loss_weights(evidence: Evidence) -> Halves:
     because the noise that it is compared with is bright, or the image would darken.
     """
     denominators = _denominators(evidence.smooth)
-    weight_a, weight_b = (
-        np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
-        for d, noise in zip(denominators, evidence.noises, strict=True)
-    )
+    with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
+        weight_a, weight_b = (
+            np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
+            for d, noise in zip(denominators, evidence.noises, strict=True)
+        )
     return weight_a, weight_b
 
 
@@ -386,7 +387,7 @@ def estimate_error(
     `held_out_error`), all is scaled down.
     """
     output = np.float32(0.5) * (fused_a + fused_b)
-    epsilon = np.float32(RELMSE_EPSILON * evidence.scale**2)
+    epsilon = _epsilon_of_renderer(evidence.scale)
     squared = (fused_a - fused_b) ** 2 / 4
     error = np.empty(len(output), np.float32)
     pilots = [(a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots[1:]]
@@ -402,6 +403,11 @@ def estimate_error(
     told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
     mean = float(error.mean(dtype=np.float64))
     return error * np.float32(min(1.0, max(told + _CONFIDENCE * standard_error, 0.0) / max(mean, 1e-30)))
+
+
+def _epsilon_of_renderer(scale: float) -> np.float32:
+    """0.01 in the renderer's units, squared differences of which are scaled twice; bounded for float32."""
+    return np.float32(min(RELMSE_EPSILON * scale**2, 1e30))
 
 
 def held_out_error(
@@ -462,7 +468,7 @@ def result_from_fused(
     if held_out_error(evidence, fused_a, fused_b) >= error_of_input:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, fused = evidence.mean, evidence.halves
-        epsilon = np.float32(RELMSE_EPSILON * evidence.scale**2)
+        epsilon = _epsilon_of_renderer(evidence.scale)
         error = (squared / (image**2 + epsilon)).mean(axis=2, keepdims=True)
     unscale = np.float32(evidence.scale)
     return FitResult(
@@ -575,12 +581,12 @@ def _log_level(image: FloatImage) -> FloatImage:
     return log_level
 
 
-def _converged(color: Buffer) -> bool:
+def _converged(color: Buffer, scale: float) -> bool:
     """Whether halves differ (copies do not) by less than lets a test tell if their noise is independent."""
     if color.half_a is None or color.half_b is None:
         return False
-    squared = color.mean**2 + np.float32(RELMSE_EPSILON)
-    noise = float(np.mean((color.half_a - color.half_b) ** 2 / 4 / squared))
+    squared = color.mean.astype(np.float64) ** 2 + RELMSE_EPSILON / scale**2
+    noise = float(np.mean((color.half_a - color.half_b).astype(np.float64) ** 2 / 4 / squared))
     sampled = 0.0 if color.variance is None else float(np.mean(color.variance / squared))
     return 0 < noise < _CONVERGED and sampled < _CONVERGED
 
