@@ -465,7 +465,8 @@ def result_from_fused(
     squared = (half_a - half_b) ** 2 / 4
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
-    if held_out_error(evidence, fused_a, fused_b) >= error_of_input:
+    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, slice(None), np.float32(RELMSE_EPSILON))
+    if told >= error_of_input:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, fused = evidence.mean, evidence.halves
         epsilon = _epsilon_of_renderer(evidence.scale)
