@@ -51,7 +51,7 @@ class _Preset:
 _PRESETS = {
     "draft": _Preset(DRAFT_PILOTS, 80),
     "balanced": _Preset(BALANCED_PILOTS, 240),
-    "final": _Preset(FINAL_PILOTS, 600),
+    "final": _Preset(FINAL_PILOTS, 240),
 }
 
 
