@@ -8,6 +8,7 @@ prints a Markdown table, one row per variant. Run it on a machine with nothing e
 import argparse
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -16,7 +17,7 @@ from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
 from tungsten_dip.report.metrics import compare
 
-Change = Callable[[], object]
+Change = Callable[[], AbstractContextManager[object]]
 
 
 def _without(unwanted: Callable[[pilots.Pilot], bool]) -> Change:
@@ -25,7 +26,7 @@ def _without(unwanted: Callable[[pilots.Pilot], bool]) -> Change:
     return lambda: mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=kept))
 
 
-def _with_one_pilot() -> object:
+def _with_one_pilot() -> AbstractContextManager[object]:
     preset = fusion._PRESETS["balanced"]
     return mock.patch.dict(
         fusion._PRESETS, balanced=replace(preset, pilots=(pilots.Pilot(10, k=1.0, step=2),))
@@ -65,7 +66,7 @@ def main() -> None:
     for name, change in VARIANTS.items():
         cells, seconds = [], 0.0
         for bench_set in sets:
-            with change():  # type: ignore[attr-defined]
+            with change():
                 start = time.perf_counter()
                 result = denoise(bench_set.buffers, settings)
                 seconds += time.perf_counter() - start

@@ -1,4 +1,4 @@
-// Finds and mends values that no renderer can have meant. Radiance is never clamped, however large.
+// Finds and mends values that no renderer can have meant. Nothing else is clamped, however large.
 #include <algorithm>
 #include <array>
 #include <cmath>

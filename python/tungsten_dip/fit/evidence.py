@@ -383,13 +383,14 @@ def estimate_error(
     ``fused_a`` and ``fused_b`` are outputs made of one half each at ``pixels``, shape (pixels, 3), in the
     units of the evidence; 0.01 is in the renderer's. The variance of f is (fused_a - fused_b)^2 / 4 in the
     mean. Its bias is not known; it is taken for `_BIAS` times the median squared difference of f and the
-    pilots, which blur in different ways. If the mean of that is more than the noisy halves allow (see
-    `held_out_error`), all is scaled down.
+    pilots, which blur in different ways, or for less if the noisy halves do not allow as much in the mean
+    (see `_told_by_halves`).
     """
     output = np.float32(0.5) * (fused_a + fused_b)
     epsilon = _epsilon_of_renderer(evidence.scale)
     squared = (fused_a - fused_b) ** 2 / 4
-    error = np.empty(len(output), np.float32)
+    variance = np.empty(len(output), np.float32)
+    bias = np.empty(len(output), np.float32)
     pilots = [(a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots[1:]]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
@@ -398,11 +399,12 @@ def estimate_error(
             (((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2) * relative).mean(axis=1)
             for a, b in pilots
         ]
-        variance = (squared[part] * relative).mean(axis=1)
-        error[part] = variance + np.float32(_BIAS) * np.median(apart, axis=0)
+        variance[part] = (squared[part] * relative).mean(axis=1)
+        bias[part] = np.float32(_BIAS) * np.median(apart, axis=0)
     told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
-    mean = float(error.mean(dtype=np.float64))
-    return error * np.float32(min(1.0, max(told + _CONFIDENCE * standard_error, 0.0) / max(mean, 1e-30)))
+    least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
+    allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
+    return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
 def _epsilon_of_renderer(scale: float) -> np.float32:

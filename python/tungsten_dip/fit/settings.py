@@ -25,8 +25,7 @@ class FitSettings:
     ``pilot`` names a denoiser that somebody else trained, as one more guess that the halves judge like the
     others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and ``channels``
     describe the network of the published method and are used by the preset ``paper`` alone. ``target_error``
-    is a relMSE (epsilon 0.01). ``threads`` None uses
-    every core.
+    is a relMSE (epsilon 0.01). ``threads`` None uses every core.
 
     Raises InputError if a number is out of its range.
     """
@@ -68,13 +67,13 @@ class HistoryPoint:
 class FitResult:
     """A denoised image and what is known about it.
 
-    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE (with
-    epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error of every
-    pixel, shape (height, width, 1), smoothed and never below what is noise in it, so that its mean is the
-    larger. ``halves`` is what was made of half A of the samples alone and of half B alone, in the units and
-    shape of ``color``, which is their mean (but for fireflies). These are None where the buffers hold no
-    independent evidence. ``model`` is the fitted network, None where there was none to fit. ``notes`` says in
-    one line each what evidence was missing and what that meant.
+    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE
+    (with epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error
+    around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
+    half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their
+    mean (but for fireflies). These are None where the buffers hold no independent evidence. ``model`` is
+    the fitted network, None where there was none to fit. ``notes`` says in one line each what evidence was
+    missing and what that meant.
     """
 
     color: FloatImage
