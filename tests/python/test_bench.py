@@ -5,7 +5,7 @@ import os
 import re
 import signal
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,14 @@ from tungsten_dip.bench.methods import Plan, settings_text
 from tungsten_dip.bench.nfor import nfor_image
 from tungsten_dip.bench.pareto import run_pareto
 from tungsten_dip.bench.results import COLUMNS, Key, Measurement, Results
-from tungsten_dip.bench.sets import read_sets
+from tungsten_dip.bench.sets import cropped_as_published, read_sets
 from tungsten_dip.bench.table import Row, SetRows, markdown_table
 from tungsten_dip.buffers import RenderBuffers, read_image, write_image, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.progress import silent
+from tungsten_dip.report.metrics import Comparison
 
 DENOISER = "TUNGSTEN_DENOISER"
 """Names Tungsten's command denoiser, where there is one."""
@@ -113,12 +114,38 @@ def test_a_missing_reference_is_one_line(folder, capfd, what):
     refused(capfd, ["bench", what, str(folder)], "no reference to measure against", "=REFERENCE.exr")
 
 
+def test_a_crop_keeps_the_middle_in_multiples_of_32(tmp_path, make_render):
+    render = make_render(67, 101)
+    write_tungsten_folder(tmp_path / "odd", render.buffers)
+    write_image(tmp_path / "odd" / "reference.exr", render.reference)
+    write_image(tmp_path / "odd" / "nfor.exr", render.reference)
+    (whole,) = read_sets([str(tmp_path / "odd")])
+    crop = cropped_as_published(whole)
+    np.testing.assert_array_equal(crop.reference, whole.reference[1:65, 2:98])
+    np.testing.assert_array_equal(crop.nfor, crop.reference)
+    planes = {(name, plane): v for name, b in whole.buffers.quantities() for plane, v in b.planes()}
+    cut = {(name, plane): v for name, b in crop.buffers.quantities() for plane, v in b.planes()}
+    assert cut.keys() == planes.keys()
+    for key, values in cut.items():
+        np.testing.assert_array_equal(values, planes[key][1:65, 2:98])
+    assert crop.name != whole.name
+    assert crop.digest != whole.digest
+    assert cropped_as_published(crop).digest == crop.digest
+
+
+def test_what_is_too_small_to_crop_is_refused(bench_set):
+    small = replace(bench_set, reference=bench_set.reference[:31])
+    with pytest.raises(InputError, match="from 32 pixels on, got room/n16 with 48 x 31"):
+        cropped_as_published(small)
+
+
 # --- results ----------------------------------------------------------------------------------------
 
 
 def measurement(repeat=0, method="draft", seconds=1.5, relmse=0.01):
     key = Key("room/n16", method, "preset=draft channels=1,2", "0.1", "abc", 'a "CPU", 2 threads', repeat)
-    return Measurement(key, seconds, 7, float("inf"), relmse, None, 0.1, None, 0, None)
+    distances = Comparison(float("inf"), relmse, None, 0.1, None, 0, None)
+    return Measurement(key=key, seconds=seconds, iterations=7, **asdict(distances))
 
 
 def test_measurements_survive_their_file(tmp_path):

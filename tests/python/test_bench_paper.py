@@ -236,6 +236,9 @@ def test_the_commands_print_tables(bench_set, tmp_path, capfd):
     assert command.main(["bench", "paper", str(tmp_path / "set"), *arguments]) == 0
     out = capfd.readouterr().out
     assert "| 12 | skip | 8-16-32-64-128 | random | IOC |" in out
+    assert "set, 48 x 32 pixels" in out
+    assert command.main(["bench", "paper", str(tmp_path / "set"), *arguments, "--crop"]) == 0
+    assert "set cropped, 32 x 32 pixels" in capfd.readouterr().out
     sizes = ["--size", "64x64", "--iterations", "1", "--repeats", "1", "--threads", "1", "--json"]
     assert command.main(["bench", "iteration", *sizes]) == 0
     assert '"speedup"' in capfd.readouterr().out

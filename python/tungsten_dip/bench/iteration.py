@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.plain_skip import PlainFit, PlainSkip
+from tungsten_dip.bench.sets import CROP_MULTIPLE
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.device import compute_device
@@ -22,7 +23,6 @@ from tungsten_dip.fit.paper import PaperFit
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 
-MULTIPLE = 32
 WARM_UP = 3
 """Iterations that are not counted."""
 
@@ -64,9 +64,9 @@ def time_iterations(
     Raises InputError if a side is no multiple of 32 (the published method crops to one) or below 64 (its
     coarsest scale would be one pixel, which cannot be normalised), or a number is below 1.
     """
-    if min(width, height) < 2 * MULTIPLE or width % MULTIPLE or height % MULTIPLE:
+    if min(width, height) < 2 * CROP_MULTIPLE or width % CROP_MULTIPLE or height % CROP_MULTIPLE:
         raise InputError(
-            f"size: expected multiples of {MULTIPLE} from {2 * MULTIPLE} on such as 512x288, "
+            f"size: expected multiples of {CROP_MULTIPLE} from {2 * CROP_MULTIPLE} on such as 512x288, "
             f"got {width}x{height}"
         )
     for name, value in (("iterations", iterations), ("repeats", repeats)):

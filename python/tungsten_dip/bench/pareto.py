@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.methods import IN_TIME, OIDN, OURS, PAPER, SAMPLES, Plan, methods_for
 from tungsten_dip.bench.page import pareto_page
 from tungsten_dip.bench.plot import require_matplotlib, write_pareto_plot
 from tungsten_dip.bench.runner import Runner, Task
-from tungsten_dip.bench.sets import BenchSet
+from tungsten_dip.bench.sets import BenchSet, cropped
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
-from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.progress import Progress, silent
 
@@ -69,11 +66,7 @@ def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
     from tungsten_dip.fit import FitSettings, denoise
     from tungsten_dip.hosts import render
 
-    corner = {
-        name: Buffer(**{plane: np.ascontiguousarray(array[:16, :16]) for plane, array in buffer.planes()})
-        for name, buffer in bench_set.buffers.quantities()
-    }
-    tiny = RenderBuffers(corner.pop("color")).with_quantities(**corner)
+    tiny = cropped(bench_set.buffers, (slice(16), slice(16)))
     if not {OURS, IN_TIME, PAPER}.isdisjoint(series):
         denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
     if OIDN in series:

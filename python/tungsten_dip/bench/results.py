@@ -11,6 +11,7 @@ from typing import Any
 
 from tungsten_dip.buffers import replacing
 from tungsten_dip.errors import InputError
+from tungsten_dip.report.metrics import Comparison
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Key:
     repeat: int
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """One row: the key, what it took and how far from the reference it is (`report.metrics.Comparison`).
+@dataclass(frozen=True, kw_only=True)
+class Measurement(Comparison):
+    """One row: the key, what it took and how far from the reference it is.
 
     ``seconds`` is None where an image was saved and nobody knows what it took. ``loss`` and ``psnr_noisy``
     are those of the published method's iteration.
@@ -41,13 +42,6 @@ class Measurement:
     key: Key
     seconds: float | None
     iterations: int | None
-    psnr: float
-    relmse: float
-    ssim: float | None
-    flip: float | None
-    hdrflip: float | None
-    nonfinite: int
-    mean_ratio: float | None
     loss: float | None = None
     psnr_noisy: float | None = None
 
@@ -88,7 +82,7 @@ class Results:
         keys = [replace(key, repeat=index) for index in range(repeats)]
         rows = [self._by_key[each] for each in keys if each in self._by_key]
         return Measurement(
-            keys[0], **{name: _median([getattr(row, name) for row in rows]) for name in VALUES}
+            key=keys[0], **{name: _median([getattr(row, name) for row in rows]) for name in VALUES}
         )
 
 
@@ -104,7 +98,7 @@ def _read(path: Path) -> list[Measurement]:
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             reader = csv.DictReader(stream)
-            if tuple(reader.fieldnames or ()) != COLUMNS:
+            if set(reader.fieldnames or ()) != set(COLUMNS):
                 raise ValueError("its columns are others")
             return [_measurement(row) for row in reader]
     except (ValueError, TypeError, csv.Error) as error:
@@ -121,4 +115,4 @@ def _measurement(row: dict[str, str]) -> Measurement:
         else:
             values[name] = text
     key = Key(**{field.name: values.pop(field.name) for field in fields(Key)})
-    return Measurement(key, **values)
+    return Measurement(key=key, **values)

@@ -94,12 +94,11 @@ class Runner:
         return Key(bench_set.name, label, settings, __version__, bench_set.digest, self._machine, task.repeat)
 
     def _measurement(self, task: Task, outcome: Outcome) -> Measurement:
-        distances = asdict(compare(outcome.image, task.bench_set.reference))
         return Measurement(
-            self._key(task, outcome.label),
-            outcome.seconds,
-            outcome.iterations,
-            **distances,
+            key=self._key(task, outcome.label),
+            seconds=outcome.seconds,
+            iterations=outcome.iterations,
+            **asdict(compare(outcome.image, task.bench_set.reference)),
             loss=outcome.loss,
             psnr_noisy=outcome.psnr_noisy,
         )

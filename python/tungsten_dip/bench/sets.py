@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers import FloatImage, RenderBuffers, read_buffers, read_image
+from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, read_buffers, read_image
 from tungsten_dip.errors import InputError
 
 REFERENCE = "reference.exr"
 NFOR = "nfor.exr"
+
+CROP_MULTIPLE = 32
+"""The published code crops images to multiples of this, two to the number of its network's scales."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,38 @@ def read_sets(texts: Sequence[str]) -> list[BenchSet]:
     return sets
 
 
+def cropped_as_published(bench_set: BenchSet) -> BenchSet:
+    """Return the middle of a set, its sides multiples of `CROP_MULTIPLE`, under a name of its own.
+
+    Raises InputError if a side is too short.
+    """
+    height, width = bench_set.reference.shape[:2]
+    if min(height, width) < CROP_MULTIPLE:
+        raise InputError(
+            f"crop: expected sides from {CROP_MULTIPLE} pixels on, got {bench_set.name} with "
+            f"{width} x {height}; measure it whole"
+        )
+    spare_rows, spare_columns = height % CROP_MULTIPLE, width % CROP_MULTIPLE
+    top, left = spare_rows // 2, spare_columns // 2
+    part = slice(top, top + height - spare_rows), slice(left, left + width - spare_columns)
+    return _bench_set(
+        f"{bench_set.name} cropped",
+        cropped(bench_set.buffers, part),
+        bench_set.reference[part],
+        None if bench_set.nfor is None else bench_set.nfor[part],
+    )
+
+
+def cropped(buffers: RenderBuffers, part: tuple[slice, slice]) -> RenderBuffers:
+    """Return rows and columns of what a fit sees: every plane of every quantity, and the samples."""
+    quantities = {
+        name: Buffer(**{plane: np.ascontiguousarray(values[part]) for plane, values in buffer.planes()})
+        for name, buffer in buffers.quantities()
+    }
+    spp = buffers.spp[part] if isinstance(buffers.spp, np.ndarray) else buffers.spp
+    return RenderBuffers(quantities.pop("color"), spp=spp).with_quantities(**quantities)
+
+
 def _read_set(text: str) -> BenchSet:
     path, reference_path = _paths(text)
     buffers, reference = read_buffers(path), read_image(reference_path)
@@ -61,11 +96,15 @@ def _read_set(text: str) -> BenchSet:
     nfor_path = _folder(path) / NFOR
     nfor = read_image(nfor_path) if nfor_path.exists() else None
     resolved = path.resolve()
+    name = "/".join((resolved.parent.name, resolved.stem)).lstrip("/")
+    return _bench_set(name, buffers, reference, nfor)
+
+
+def _bench_set(name: str, buffers: RenderBuffers, reference: FloatImage, nfor: FloatImage | None) -> BenchSet:
     digest = hashlib.sha256()
     images = [reference, *(plane for _, buffer in buffers.quantities() for _, plane in buffer.planes())]
     for image in images if nfor is None else [*images, nfor]:
         digest.update(np.ascontiguousarray(image).tobytes())
-    name = "/".join((resolved.parent.name, resolved.stem)).lstrip("/")
     return BenchSet(name, buffers, reference, nfor, digest.hexdigest()[:12])
 
 

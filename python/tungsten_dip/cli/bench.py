@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tungsten_dip.cli.console import duration, progress_on_stderr
+from tungsten_dip.cli.console import add_json, add_threads, duration, integers, progress_on_stderr
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -52,7 +52,8 @@ def add_bench(commands: _SubParsersAction[Any]) -> None:
     add = paper.add_argument
     _add_common(paper, "bench-paper", one=True)
     add("--iterations", metavar="N", type=int, default=3000, help="of every row (default: 3000)")
-    add("--rows", metavar="N,N,...", type=_numbers, help="only these rows, from 1 to 13, and no figure")
+    add("--rows", metavar="N,N,...", type=integers, help="only these rows, from 1 to 13, and no figure")
+    add("--crop", action="store_true", help="take the middle, in multiples of 32 pixels, as published")
     add("--published", metavar="SCENE", help="the published scene: cornell-box (default), car2 or lamp")
 
     iteration = benches.add_parser(
@@ -63,7 +64,8 @@ def add_bench(commands: _SubParsersAction[Any]) -> None:
     add("--size", metavar="WxH", type=_size, default=(512, 288), help="multiples of 32 (default: 512x288)")
     add("--iterations", metavar="N", type=int, default=10, help="per repeat (default: 10)")
     add("--repeats", metavar="N", type=int, default=5, help="in turns (default: 5)")
-    _add_threads_and_json(iteration)
+    add_threads(iteration)
+    add_json(iteration)
 
 
 def _add_common(parser: argparse.ArgumentParser, folder: str, one: bool = False) -> None:
@@ -77,12 +79,8 @@ def _add_common(parser: argparse.ArgumentParser, folder: str, one: bool = False)
         default=Path(folder),
         help=f"where results are, and a run goes on (default: {folder})",
     )
-    _add_threads_and_json(parser)
-
-
-def _add_threads_and_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, nothing else")
+    add_threads(parser)
+    add_json(parser)
 
 
 def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -116,9 +114,11 @@ def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from tungsten_dip.bench.paper_table import SCENES, run_paper_table
-    from tungsten_dip.bench.sets import read_sets
+    from tungsten_dip.bench.sets import cropped_as_published, read_sets
 
     (bench_set,) = read_sets(options.sets)
+    if options.crop:
+        bench_set = cropped_as_published(bench_set)
     with progress_on_stderr("fitting") as progress:
         text = run_paper_table(
             bench_set,
@@ -155,13 +155,6 @@ def _names(text: str) -> tuple[str, ...]:
 
 def _durations(text: str) -> tuple[float, ...]:
     return tuple(duration(part) for part in text.split(","))
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected numbers such as 1,7,13, got '{text}'") from None
 
 
 def _size(text: str) -> tuple[int, int]:

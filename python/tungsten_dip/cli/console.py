@@ -151,6 +151,27 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
     print(f"{what}: done in {tqdm.format_interval(time.monotonic() - start)}", file=sys.stderr, flush=True)
 
 
+def add_threads(parser: argparse._ActionsContainer) -> None:
+    """Add ``--threads``."""
+    parser.add_argument("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+
+
+def add_json(parser: argparse._ActionsContainer) -> None:
+    """Add ``--json`` (`json_on_stdout`)."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, nothing else")
+
+
+def integers(text: str) -> tuple[int, ...]:
+    """Return the integers of ``1,7,13``.
+
+    Raises argparse.ArgumentTypeError if the text is anything else.
+    """
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected integers such as 1,7,13, got '{text}'") from None
+
+
 def duration(text: str, default_unit: str = "s") -> float:
     """Return the seconds of ``90s``, ``5m``, ``1.5h`` or ``1h30m``; a bare number has the default unit.
 

@@ -18,6 +18,8 @@ from tungsten_dip.report.page import report_page
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
 
+MAP_HELP = "take this layer of the input for color, albedo, normal, depth, colorA, ..."
+
 REPORT_HELP = "write a page with the pictures, the error and what led to them"
 
 
@@ -33,6 +35,13 @@ def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")
     add(f"{flag}save-model", dest="save_model", metavar="M.onnx", type=Path, help="save the fitted network")
     add(f"{flag}warm-start", dest="warm_start", metavar="M.onnx", type=Path, help="start from this network")
+
+
+def add_file_options(parser: argparse._ActionsContainer) -> None:
+    """Add how buffers are read and their results are written."""
+    add = parser.add_argument
+    add("--map", metavar="NAME=CHANNEL", type=_name_and_channel, action="append", default=[], help=MAP_HELP)
+    add("--half", action="store_true", help="write 16-bit floats")
 
 
 def fit_settings(
@@ -87,11 +96,7 @@ def write_report(
         temporary.write_text(page, encoding="utf-8")
 
 
-def name_and_channel(text: str) -> tuple[str, str]:
-    """Return the two sides of a --map, NAME=CHANNEL.
-
-    Raises argparse.ArgumentTypeError if the text is anything else.
-    """
+def _name_and_channel(text: str) -> tuple[str, str]:
     name, separator, channel = text.partition("=")
     if not (name and separator and channel):
         raise argparse.ArgumentTypeError(f"expected NAME=CHANNEL such as color=beauty, got '{text}'")

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.buffers import check_writable, replacing
-from tungsten_dip.cli.console import progress_on_stderr
+from tungsten_dip.cli.console import add_json, add_threads, progress_on_stderr
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
+    add_file_options,
     add_fit_options,
     fit_settings,
     load_warm_start,
-    name_and_channel,
 )
 from tungsten_dip.errors import InputError
 
@@ -33,9 +33,9 @@ TONEMAP = "gamma"
 """How the page shows frames: Tungsten's default."""
 
 
-def add_sequence(commands: _SubParsersAction[Any]) -> argparse.ArgumentParser:
-    """Add ``sequence``; return its parser."""
-    sequence: argparse.ArgumentParser = commands.add_parser(
+def add_sequence(commands: _SubParsersAction[Any]) -> None:
+    """Add ``sequence``."""
+    sequence = commands.add_parser(
         "sequence", help="denoise the frames of an animation, each from the one before"
     )
     sequence.set_defaults(action=_sequence)
@@ -48,18 +48,10 @@ def add_sequence(commands: _SubParsersAction[Any]) -> argparse.ArgumentParser:
     add("--scheduler", metavar="local|tcp://...", default="local", help="a Dask scheduler that runs already")
     add("--workers", metavar="N", type=int, default=1, help="how many local processes (default: 1)")
     add_fit_options(sequence, prefix="")
-    add("--threads", metavar="N", type=int, help="how many cores a frame uses (default: all there are)")
-    add(
-        "--map",
-        metavar="NAME=CHANNEL",
-        type=name_and_channel,
-        action="append",
-        default=[],
-        help="as for denoise",
-    )
-    add("--half", action="store_true", help="write 16-bit floats")
+    add_file_options(sequence)
     add("--report", metavar="R.html", type=Path, help="write a page with the frames, their time and error")
-    return sequence
+    add_threads(sequence)
+    add_json(sequence)
 
 
 _REFIT_HELP = (

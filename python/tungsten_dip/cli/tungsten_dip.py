@@ -20,15 +20,24 @@ from tungsten_dip.buffers import (
     write_image,
 )
 from tungsten_dip.cli.bench import add_bench
-from tungsten_dip.cli.console import Parser, json_on_stdout, progress_on_stderr, remarks_from_log, run
+from tungsten_dip.cli.console import (
+    Parser,
+    add_json,
+    add_threads,
+    integers,
+    json_on_stdout,
+    progress_on_stderr,
+    remarks_from_log,
+    run,
+)
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     REPORT_HELP,
+    add_file_options,
     add_fit_options,
     denoise_with_progress,
     fit_settings,
     load_warm_start,
-    name_and_channel,
     write_model,
     write_report,
 )
@@ -37,8 +46,6 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
-
-MAP_HELP = "take this layer of the input for color, albedo, normal, depth, colorA, ..."
 
 TONEMAP = "gamma"
 """How saved buffers are displayed: Tungsten's default."""
@@ -72,13 +79,13 @@ def _parser() -> argparse.ArgumentParser:
     add_fit_options(denoise, prefix="")
     add("--iterations", metavar="N", type=int, help="stop the fit after this many iterations")
     add("--seed", metavar="N", type=int, help="of the network's first weights and its input (default: 0)")
-    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+    add_threads(denoise)
     types = get_type_hints(FitSettings)
     paper = denoise.add_argument_group("the network of the published method, with --preset paper")
     paper.add_argument("--network", choices=get_args(types["network"]), help="(default: skip)")
     paper.add_argument("--inputs", choices=get_args(Inputs), help="(default: all+random)")
     paper.add_argument("--scheme", choices=get_args(types["scheme"]), help="(default: iic)")
-    paper.add_argument("--channels", metavar="8,16,...", type=_counts, help="(default: 8,16,32,64,128)")
+    paper.add_argument("--channels", metavar="8,16,...", type=integers, help="(default: 8,16,32,64,128)")
 
     infer = commands.add_parser("infer", help="denoise with a network that was saved, without torch")
     infer.set_defaults(action=_infer)
@@ -88,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_output_options(infer)
     add("--refit", metavar="N", type=int, default=0, help="first train on this image, N steps at most")
     add("--save-model", metavar="M.onnx", type=Path, help="save the network after --refit")
-    add("--threads", metavar="N", type=int, help="how many cores to use (default: all)")
+    add_threads(infer)
 
     inspect = commands.add_parser("inspect", help="show what a scene calls for, or what a file holds")
     inspect.set_defaults(action=_inspect)
@@ -99,13 +106,10 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("image", metavar="IMAGE", type=Path)
     compare.add_argument("reference", metavar="REFERENCE", type=Path)
 
-    sequence = add_sequence(commands)
+    for command in (denoise, infer, inspect, compare):
+        add_json(command)
+    add_sequence(commands)
     add_bench(commands)
-
-    for command in (denoise, infer, inspect, compare, sequence):
-        command.add_argument(
-            "--json", action="store_true", help="print one JSON object on stdout, nothing else"
-        )
     return parser
 
 
@@ -119,9 +123,9 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="where to write the denoised image",
     )
-    add = parser.add_argument_group("files").add_argument
-    add("--map", metavar="NAME=CHANNEL", type=name_and_channel, action="append", default=[], help=MAP_HELP)
-    add("--half", action="store_true", help="write 16-bit floats")
+    files = parser.add_argument_group("files")
+    add_file_options(files)
+    add = files.add_argument
     add("--error-map", metavar="E.exr", type=Path, help="write the estimated error of every pixel")
     add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
 
@@ -223,10 +227,3 @@ def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     facts = asdict(tungsten_dip.compare(read_image(options.image), read_image(options.reference)))
     lines = (f"{name:<11}{'-' if value is None else f'{value:.5g}'}" for name, value in facts.items())
     return facts, "\n".join(lines)
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected counts such as 8,16,32,64,128, got '{text}'") from None
