@@ -7,7 +7,7 @@ import pytest
 from browser import assert_page_works
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
-from tungsten_dip.report.page import report_page
+from tungsten_dip.report.page import _round_ticks, report_page
 from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, error_in_false_color, side_by_side
 
 VOID = {"meta", "img", "input", "line", "circle", "polyline", "link", "br"}
@@ -90,6 +90,19 @@ def test_the_curve_goes_through_every_point(render, result):
     np.testing.assert_allclose(np.polyval(np.polyfit(seconds, x, 1), seconds), x, atol=0.2)
     np.testing.assert_allclose(np.polyval(np.polyfit(levels, y, 1), levels), y, atol=0.2)
     assert np.all(np.diff(y) > 0)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (0.006, 0.0099, [0.005, 0.01]),
+        (0.0011, 0.03, [0.001, 0.002, 0.005, 0.01, 0.02, 0.05]),
+        (0.02, 0.02, [0.02, 0.05]),
+        (3e-5, 0.2, [1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1]),
+    ],
+)
+def test_ticks_enclose_the_errors(low, high, ticks):
+    assert _round_ticks(low, high) == ticks
 
 
 def test_what_is_not_known_is_said_and_not_drawn(render):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +36,9 @@ METRICS = (
 """Attribute of `Comparison`, what it is called, and whether its axis is logarithmic."""
 
 MARKERS = dict(zip(SERIES, "oosD^v", strict=True))
+LINE_POINTS = 50
+"""Where words are put, a line between two points counts as this many points that are in the way."""
+
 _JOINED = (OURS, IN_TIME, PAPER, SAMPLES, OIDN)
 
 
@@ -85,7 +90,7 @@ def write_pareto_plot(folder: Path, found: Sequence[SetRows]) -> None:
 def pareto_svgs(each: SetRows) -> Iterator[tuple[str, str]]:
     """Yield (title, SVG in the page's colours) for every metric of a set."""
     for name, title, logarithmic in METRICS:
-        with _figure(4.8, 3.2) as figure:
+        with _figure(4.2, 3) as figure:
             axes = figure.subplots()
             _write_marks(figure, [(axes, _draw(axes, each.rows, name, logarithmic, _PAGE))])
             yield title, _for_page(figure, title)
@@ -161,7 +166,7 @@ def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, color
             axes.plot(seconds, values, line, color=color, marker=MARKERS[series], ms=4, lw=1.2, label=series)
             marks += [_Mark(mark, second, value, color) for second, value, mark in timed]
     axes.margins(x=0.12, y=0.12)
-    _end_at_noisy(axes, rows, metric)
+    _end_with_the_better(axes, rows, metric)
     for axis in (axes.xaxis, axes.yaxis) if logarithmic else (axes.xaxis,):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -169,16 +174,20 @@ def _draw(axes: Axes, rows: Sequence[Row], metric: str, logarithmic: bool, color
     return marks
 
 
-def _end_at_noisy(axes: Axes, rows: Sequence[Row], metric: str) -> None:
-    """Leave out what is worse than doing nothing, which would press all the rest together."""
-    noisy = next((getattr(row.median, metric) for row in rows if row.label == NOISY), None)
+def _end_with_the_better(axes: Axes, rows: Sequence[Row], metric: str) -> None:
+    """Leave out what is worse than the noisy image, which would press all the rest together."""
+    value_of = {row.label: value for row in rows if (value := getattr(row.median, metric)) is not None}
+    noisy = value_of.pop(NOISY, None)
     if noisy is None:
         return
-    low, high = axes.get_ylim()
-    if metric == "psnr":
-        axes.set_ylim(max(low, min(noisy, high - 1)), high)
-    else:
-        axes.set_ylim(low, min(high, max(noisy, low * 1.1)))
+    sign = 1 if metric == "psnr" else -1
+    better = [value for value in value_of.values() if sign * value >= sign * noisy and math.isfinite(value)]
+    if better:
+        scale = axes.yaxis.get_transform()
+        ends = axes.yaxis.get_major_locator().nonsingular(min(better), max(better))
+        low, high = scale.transform(ends)
+        margin = 0.12 * (high - low)
+        axes.set_ylim(*scale.inverted().transform([low - margin, high + margin]))
 
 
 def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) -> None:
@@ -190,14 +199,15 @@ def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) 
         box = axes.get_window_extent()
         places = [axes.transData.transform((mark.seconds, mark.value)) for mark in marks]
         taken = [(x - 3 * point, y - 3 * point, x + 3 * point, y + 3 * point) for x, y in places]
+        taken += [(x - point, y - point, x + point, y + point) for x, y in _points_on_lines(axes)]
         for mark, (x, y) in zip(marks, places, strict=True):
             if not mark.word or not box.y0 <= y <= box.y1:
                 continue
             width, height = 4.6 * len(mark.word) * point, 8 * point
             free = [
                 (left, bottom, left + width, bottom + height)
-                for bottom in (y + 2 * point, y - 2 * point - height)
-                for left in (x + 3 * point, x - 3 * point - width)
+                for bottom in (y + 3 * point, y - 3 * point - height)
+                for left in (x + 3 * point, x - 3 * point - width, x - width / 2)
                 if box.x0 <= left and left + width <= box.x1 and bottom >= box.y0
             ]
             if not free:
@@ -206,6 +216,18 @@ def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) 
             taken.append(best)
             left, bottom = axes.transAxes.inverted().transform(best[:2])
             axes.text(left, bottom, mark.word, transform=axes.transAxes, color=mark.color, fontsize=7)
+
+
+def _points_on_lines(axes: Axes) -> Iterator[tuple[float, float]]:
+    """Yield points in pixels along all lines."""
+    for line in axes.get_lines():
+        if line.get_linestyle() == "None":
+            continue
+        corners = line.get_transform().transform(line.get_xydata())
+        for (x0, y0), (x1, y1) in pairwise(corners.tolist()):
+            for step in range(LINE_POINTS):
+                along = step / LINE_POINTS
+                yield x0 + along * (x1 - x0), y0 + along * (y1 - y0)
 
 
 def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:

@@ -16,7 +16,7 @@ from tungsten_dip.report.preview import error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
 
 CURVE_WIDTH, CURVE_HEIGHT = 720, 260
-CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 90, 24, 12, 56
+CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 90, 24, 20, 56
 """Size of the plot and its margins in the units of the SVG."""
 
 
@@ -108,7 +108,8 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
         return "<p>Nothing independent was there to judge by, so the error was not estimated on the way.</p>"
     seconds = [point.seconds for point, _ in known]
     levels = [math.log10(relmse) for _, relmse in known]
-    bottom, top = math.floor(min(levels)), max(math.ceil(max(levels)), math.floor(min(levels)) + 1)
+    ticks = _round_ticks(10 ** min(levels), 10 ** max(levels))
+    bottom, top = math.log10(ticks[0]), math.log10(ticks[-1])
 
     def x(time_s: float) -> float:
         return CURVE_LEFT + time_s / max(seconds[-1], 1e-9) * (CURVE_WIDTH - CURVE_LEFT - CURVE_RIGHT)
@@ -118,8 +119,8 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
 
     drawn = []
     right = CURVE_WIDTH - CURVE_RIGHT
-    for exponent in range(bottom, top + 1):
-        at, label = f"{y(exponent):.1f}", f"{10.0**exponent:g}"
+    for tick in ticks:
+        at, label = f"{y(math.log10(tick)):.1f}", f"{tick:g}"
         drawn.append(f'<line class="gridline" x1="{CURVE_LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
         drawn.append(f'<text x="{CURVE_LEFT - 8}" y="{at}" dy="4" text-anchor="end">{label}</text>')
     step = _round_step(seconds[-1] / 6)
@@ -138,6 +139,16 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
         f'viewBox="0 0 {CURVE_WIDTH} {CURVE_HEIGHT}" aria-label="Estimated relMSE over seconds">'
         f"{''.join(drawn)}</svg>"
     )
+
+
+def _round_ticks(low: float, high: float) -> list[float]:
+    """Return 1, 2 and 5 times powers of ten, the powers alone where these are many, that enclose a range."""
+    exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 2)
+    digits = (1, 2, 5) if len(exponents) <= 4 else (1,)
+    ticks = [float(f"{digit}e{exponent}") for exponent in exponents for digit in digits]
+    first = max(index for index, tick in enumerate(ticks) if tick <= low * (1 + 1e-9))
+    last = min(index for index, tick in enumerate(ticks) if tick >= high * (1 - 1e-9))
+    return ticks[first : max(last, first + 1) + 1]
 
 
 def _round_step(least: float) -> float:
