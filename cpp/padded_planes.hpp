@@ -13,6 +13,9 @@ namespace tungsten_dip {
 // outwards: no loop needs to ask where the image ends.
 class PaddedPlanes {
   public:
+    // How far a loop over whole vectors may read beyond the margin; what it finds there is of no use.
+    static constexpr std::size_t overread = 7;
+
     PaddedPlanes(int channels, int height, int width, int margin)
         : channels_(channels),
           height_(height),
@@ -20,7 +23,8 @@ class PaddedPlanes {
           margin_(margin),
           stride_(width + 2 * margin),
           pixels_(static_cast<std::size_t>(channels) * static_cast<std::size_t>(height + 2 * margin) *
-                  static_cast<std::size_t>(stride_)) {}
+                      static_cast<std::size_t>(stride_) +
+                  overread) {}
 
     PaddedPlanes(ConstImage image, int margin, int threads)
         : PaddedPlanes(image.channels, image.height, image.width, margin) {
@@ -39,6 +43,8 @@ class PaddedPlanes {
     [[nodiscard]] int channels() const { return channels_; }
     [[nodiscard]] int height() const { return height_; }
     [[nodiscard]] int width() const { return width_; }
+    // How far the planes of two channels lie apart.
+    [[nodiscard]] std::ptrdiff_t plane_size() const { return (height_ + 2 * margin_) * stride_; }
     [[nodiscard]] float* row(int c, int y) { return pixels_.data() + offset(c, y); }
     [[nodiscard]] const float* row(int c, int y) const { return pixels_.data() + offset(c, y); }
 

@@ -1,11 +1,15 @@
 // Local first-order regression: the pilots from which the fit composes its image.
 //
-// A tile of pixels is carried through all offsets of the window together, so that every sum of the normal
-// equations is one vectorised loop over a row, and the sums of a tile stay in the cache.
+// Both of its sums, those of the normal equations and those of the predictions, are weighted sums of planes
+// that depend on the neighbour alone: products of its features and colour, or the coefficients of its fit. A
+// tile computes the planes once, and the weights of a row of neighbours together, so that a sum stays in a
+// register while it runs over that row. Features are counted from an origin within the tile: sums of squares
+// of large values would lose the small differences.
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <iterator>
 #include <stdexcept>
 #include <vector>
 
@@ -19,7 +23,6 @@ namespace {
 
 constexpr int tile_width = 64;
 constexpr int tile_height = 8;
-constexpr int tile_pixels = tile_width * tile_height;
 constexpr int colors = 3;
 constexpr int max_features = 16;
 
@@ -34,123 +37,227 @@ struct Tile {
     int width;
 };
 
-struct Offset {
-    int y;
-    int x;
-};
+// One row of every feature.
+using FeatureRows = std::array<const float*, max_features>;
+using FeatureValues = std::array<float, max_features>;
 
-// distance += the noise-corrected squared difference of one row of the guide to another, in units of its
-// noise (Rousselle et al. 2012, equation 2).
-TUNGSTEN_DIP_FASTEST void add_guide_distance(const float* p, const float* q, const float* variance_p,
-                                             const float* variance_q, float k_squared, float scale, int count,
-                                             float* distance) {
-    for (int i = 0; i < count; ++i) {
-        const float difference = p[i] - q[i];
-        const float noise = variance_p[i] + std::min(variance_p[i], variance_q[i]);
-        distance[i] += scale * (difference * difference - noise) /
-                       (least_variance + k_squared * (variance_p[i] + variance_q[i]));
+// Neighbouring pixels that are computed together.
+constexpr int lanes = 8;
+constexpr int planes_at_once = 8;
+using Lanes [[gnu::vector_size(lanes * sizeof(float))]] = float;
+using LanesInMemory [[gnu::aligned(alignof(float)), gnu::may_alias]] = Lanes;
+
+constexpr int rounded_up(int count, int multiple) { return (count + multiple - 1) / multiple * multiple; }
+
+// distances = the noise-corrected squared differences of one row of the guide from another, in units of its
+// noise (Rousselle et al. 2012, equation 2), averaged over channels.
+TUNGSTEN_DIP_FASTEST void compare_rows(const float* p, const float* q, const float* variance_p,
+                                       const float* variance_q, std::ptrdiff_t plane, int channels,
+                                       float k_squared, int count, float* distances) {
+    std::fill_n(distances, count, 0.0F);
+    const float scale = 1.0F / static_cast<float>(channels);
+    for (int c = 0; c < channels; ++c) {
+        for (int x = 0; x < count; ++x) {
+            const float difference = p[x] - q[x];
+            const float noise = variance_p[x] + std::min(variance_p[x], variance_q[x]);
+            distances[x] += scale * (difference * difference - noise) /
+                            (least_variance + k_squared * (variance_p[x] + variance_q[x]));
+        }
+        p += plane;
+        q += plane;
+        variance_p += plane;
+        variance_q += plane;
     }
 }
 
-// sums[i] = the mean of `count_of_terms` values that lie `step` apart, starting at values[i].
-TUNGSTEN_DIP_FASTEST void sliding_mean(const float* values, int count_of_terms, std::ptrdiff_t step,
-                                       int count, float* sums) {
-    const float scale = 1.0F / static_cast<float>(count_of_terms);
-    std::fill_n(sums, count, 0.0F);
-    for (int term = 0; term < count_of_terms; ++term) {
-        for (int i = 0; i < count; ++i) sums[i] += scale * values[i + term * step];
+// means[x] = the mean of the `size` x `size` distances from distances[x] on, but never negative. Leaves sums
+// of columns in the first row of the distances.
+TUNGSTEN_DIP_FASTEST void average_patches(float* distances, int size, int columns, int count, float* means) {
+    for (int row = 1; row < size; ++row) {
+        for (int x = 0; x < columns; ++x) distances[x] += distances[row * columns + x];
+    }
+    std::fill_n(means, count, 0.0F);
+    for (int column = 0; column < size; ++column) {
+        for (int x = 0; x < count; ++x) means[x] += distances[x + column];
+    }
+    const float scale = 1.0F / static_cast<float>(size * size);
+    for (int x = 0; x < count; ++x) means[x] = std::max(scale * means[x], 0.0F);
+}
+
+// weights = exp(-distance), to which a row of features adds its distance from another.
+TUNGSTEN_DIP_FASTEST void weigh_row(const float* p, const float* q, std::ptrdiff_t plane,
+                                    const FeatureValues& penalty, int feature_count, int count,
+                                    float* weights) {
+    for (int f = 0; f < feature_count; ++f, p += plane, q += plane) {
+        const float scale = penalty[static_cast<std::size_t>(f)];
+        if (scale <= 0) continue;
+        for (int x = 0; x < count; ++x) weights[x] += scale * (p[x] - q[x]) * (p[x] - q[x]);
+    }
+    for (int x = 0; x < count; ++x) weights[x] = exp_minus(std::max(weights[x], 0.0F));
+}
+
+// What a row of neighbours adds to the normal equations: planes of 1, f, f f' (upper triangle), and per
+// colour of y and y f.
+TUNGSTEN_DIP_FASTEST void carry_products(const FeatureRows& features, const FeatureValues& origin, int n,
+                                         const std::array<const float*, colors>& target, int count,
+                                         int stride, float* planes) {
+    std::fill_n(planes, count, 1.0F);
+    const float* const centred = planes += stride;
+    for (int f = 0; f < n; ++f, planes += stride) {
+        const auto i = static_cast<std::size_t>(f);
+        for (int x = 0; x < count; ++x) planes[x] = features[i][x] - origin[i];
+    }
+    for (int f = 0; f < n; ++f) {
+        const float* a = centred + static_cast<std::ptrdiff_t>(f) * stride;
+        for (int g = f; g < n; ++g, planes += stride) {
+            const float* b = centred + static_cast<std::ptrdiff_t>(g) * stride;
+            for (int x = 0; x < count; ++x) planes[x] = a[x] * b[x];
+        }
+    }
+    for (const float* y : target) {
+        std::copy_n(y, count, planes);
+        planes += stride;
+        for (int f = 0; f < n; ++f, planes += stride) {
+            const float* a = centred + static_cast<std::ptrdiff_t>(f) * stride;
+            for (int x = 0; x < count; ++x) planes[x] = y[x] * a[x];
+        }
     }
 }
 
-TUNGSTEN_DIP_FASTEST void add_feature_distance(const float* p, const float* q, float penalty, int count,
-                                               float* distance) {
-    for (int i = 0; i < count; ++i) distance[i] += penalty * (p[i] - q[i]) * (p[i] - q[i]);
+// What a row of neighbours adds to the predictions: per colour planes of what its fit says at the origin and
+// of its slopes, and one of 1.
+TUNGSTEN_DIP_FASTEST void carry_coefficients(const FeatureRows& features, const FeatureValues& origin, int n,
+                                             const float* const* coefficients, int count, int stride,
+                                             float* planes) {
+    for (int c = 0; c < colors; ++c) {
+        float* constant = planes;
+        std::copy_n(*coefficients++, count, constant);
+        planes += stride;
+        for (int f = 0; f < n; ++f, planes += stride) {
+            const auto i = static_cast<std::size_t>(f);
+            std::copy_n(*coefficients++, count, planes);
+            for (int x = 0; x < count; ++x) constant[x] -= planes[x] * (features[i][x] - origin[i]);
+        }
+    }
+    std::fill_n(planes, count, 1.0F);
 }
 
-TUNGSTEN_DIP_FASTEST void weights_from_distances(int count, float* values) {
-    for (int i = 0; i < count; ++i) values[i] = exp_minus(std::max(values[i], 0.0F));
+// Adds to a row of every sum the row of the same plane, weighted, at `offset_count` neighbours in a row,
+// `step` pixels apart.
+TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, int offset_count, int step, const float* planes,
+                                       std::ptrdiff_t stride, int plane_count, int count, float* sums) {
+    for (int first = 0; first < plane_count; first += planes_at_once, planes += planes_at_once * stride) {
+        for (int x = 0; x < count; x += lanes) {
+            std::array<Lanes, planes_at_once> sum_of_plane{};
+            const float* weight = weights + x;
+            const float* neighbour = planes + x;
+            for (int k = 0; k < offset_count; ++k, weight += tile_width, neighbour += step) {
+                const float* value = neighbour;
+#pragma GCC unroll planes_at_once
+                for (Lanes& sum : sum_of_plane) {
+                    sum += reinterpret_cast<const LanesInMemory&>(*weight) *
+                           reinterpret_cast<const LanesInMemory&>(*value);
+                    value += stride;
+                }
+            }
+            float* to = sums + x;
+#pragma GCC unroll planes_at_once
+            for (const Lanes& sum : sum_of_plane) {
+                reinterpret_cast<LanesInMemory&>(*to) += sum;
+                to += tile_width;
+            }
+        }
+        sums += std::ptrdiff_t{planes_at_once} * tile_width;
+    }
 }
 
-// Adds one row of neighbours to the normal equations: the sums of w, w f, w f f' (upper triangle), and per
-// colour of w y and w y f.
-TUNGSTEN_DIP_FASTEST void add_to_normal_equations(const float* weights,
-                                                  const std::array<const float*, max_features>& features_p,
-                                                  const std::array<const float*, max_features>& features_q,
-                                                  const std::array<const float*, colors>& target_q,
-                                                  int feature_count, int count, float* sums) {
-    std::array<std::array<float, tile_width>, max_features> centred;  // NOLINT: filled below
-    std::array<float, tile_width> weighted;                           // NOLINT: filled below
-    const auto add = [&](const float* a, const float* b) {
-        for (int i = 0; i < count; ++i) sums[i] += a[i] * b[i];
-        sums += tile_pixels;
+// Pixels whose normal equations are solved together.
+constexpr int systems = 4;
+using Systems [[gnu::vector_size(systems * sizeof(double))]] = double;
+
+// The lower triangle of the features' covariances, and below it a row per colour: its covariances with the
+// features, which become its slopes.
+using Equations = std::array<std::array<Systems, max_features>, max_features + colors>;
+
+// Solves by Cholesky's factors, A = L L'. The factorisation takes the rows of the colours through the
+// forward substitution as if they belonged to the matrix.
+TUNGSTEN_DIP_FASTEST void solve(std::size_t n, double ridge, Equations& a) {
+    for (std::size_t m = 0; m < n; ++m) {
+        Systems& pivot = a[m][m];
+        // No pivot is less than the ridge, but for rounding.
+        for (int s = 0; s < systems; ++s) pivot[s] = 1 / std::sqrt(std::max(pivot[s], ridge));
+        for (std::size_t i = m + 1; i < n + colors; ++i) a[i][m] *= pivot;
+        for (std::size_t j = m + 1; j < n; ++j) {
+            for (std::size_t i = j; i < n + colors; ++i) a[i][j] -= a[i][m] * a[j][m];
+        }
+    }
+    for (std::size_t c = n; c < n + colors; ++c) {
+        for (std::size_t m = n; m-- > 0;) {
+            for (std::size_t i = m + 1; i < n; ++i) a[c][m] -= a[i][m] * a[c][i];
+            a[c][m] *= a[m][m];
+        }
+    }
+}
+
+// Fits `count` pixels, `systems` at most, from their sums of the planes of `carry_products`, which lie
+// tile_width apart. Writes, in planes, what the fit says at the pixel itself and its slopes, for every
+// colour.
+TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& features,
+                                     const FeatureValues& origin, std::size_t n, double ridge, int count,
+                                     float* coefficients, std::ptrdiff_t plane) {
+    Equations a;                             // NOLINT(*-member-init): filled below
+    std::array<Systems, max_features> mean;  // NOLINT(*-member-init)
+    Systems scale;                           // NOLINT(*-member-init)
+    for (int s = 0; s < systems; ++s) scale[s] = 1.0 / std::max(sums[s], least_weight_sum);
+    const auto next = [&](Systems& values) {
+        sums += tile_width;
+        for (int s = 0; s < systems; ++s) values[s] = static_cast<double>(sums[s]);
+        values *= scale;
     };
-    const auto n = static_cast<std::size_t>(feature_count);
+    for (std::size_t f = 0; f < n; ++f) next(mean[f]);
     for (std::size_t f = 0; f < n; ++f) {
-        for (int i = 0; i < count; ++i)
-            centred[f][static_cast<std::size_t>(i)] = features_q[f][i] - features_p[f][i];
+        for (std::size_t g = f; g < n; ++g) {
+            next(a[g][f]);
+            a[g][f] -= mean[f] * mean[g];
+        }
+        for (int s = 0; s < systems; ++s) a[f][f][s] = std::max(a[f][f][s], 0.0) + ridge;
     }
-    for (int i = 0; i < count; ++i) sums[i] += weights[i];
-    sums += tile_pixels;
-    for (std::size_t f = 0; f < n; ++f) add(weights, centred[f].data());
+    std::array<Systems, colors> constant;  // NOLINT(*-member-init)
+    for (std::size_t c = 0; c < colors; ++c) {
+        next(constant[c]);
+        for (std::size_t f = 0; f < n; ++f) {
+            next(a[n + c][f]);
+            a[n + c][f] -= mean[f] * constant[c];
+        }
+    }
+    solve(n, ridge, a);
+    const auto write = [&](const Systems& values) {
+        for (int s = 0; s < count; ++s) coefficients[s] = static_cast<float>(values[s]);
+        coefficients += plane;
+    };
     for (std::size_t f = 0; f < n; ++f) {
-        for (int i = 0; i < count; ++i)
-            weighted[static_cast<std::size_t>(i)] = weights[i] * centred[f][static_cast<std::size_t>(i)];
-        for (std::size_t g = f; g < n; ++g) add(weighted.data(), centred[g].data());
+        for (int s = 0; s < systems; ++s) mean[f][s] -= static_cast<double>(features[f][s] - origin[f]);
     }
     for (std::size_t c = 0; c < colors; ++c) {
-        for (int i = 0; i < count; ++i) weighted[static_cast<std::size_t>(i)] = weights[i] * target_q[c][i];
-        for (int i = 0; i < count; ++i) sums[i] += weighted[static_cast<std::size_t>(i)];
-        sums += tile_pixels;
-        for (std::size_t f = 0; f < n; ++f) add(weighted.data(), centred[f].data());
+        for (std::size_t f = 0; f < n; ++f) constant[c] -= a[n + c][f] * mean[f];
+        write(constant[c]);
+        for (std::size_t f = 0; f < n; ++f) write(a[n + c][f]);
     }
 }
 
-// sums[c] += w (constant_c + slope_c . (f(p) - f(q))): what the fits around q predict at p.
-TUNGSTEN_DIP_FASTEST void add_predictions(const float* weights,
-                                          const std::array<const float*, max_features>& features_p,
-                                          const std::array<const float*, max_features>& features_q,
-                                          const float* const* coefficients, int feature_count, int count,
-                                          float* sums) {
-    std::array<float, tile_width> prediction;  // NOLINT: filled below
-    const auto n = static_cast<std::size_t>(feature_count);
-    for (int c = 0; c < colors; ++c, sums += tile_pixels) {
-        const float* constant = *coefficients++;
-        for (int i = 0; i < count; ++i) prediction[static_cast<std::size_t>(i)] = constant[i];
-        for (std::size_t f = 0; f < n; ++f) {
-            const float* slope = *coefficients++;
-            const float* p = features_p[f];
-            const float* q = features_q[f];
-            for (int i = 0; i < count; ++i)
-                prediction[static_cast<std::size_t>(i)] += slope[i] * (p[i] - q[i]);
+// colors[c] = (constant_c + slope_c . (f - origin)) / weight, from the sums of the planes of
+// `carry_coefficients`, which lie tile_width apart.
+TUNGSTEN_DIP_FASTEST void predict_row(const float* sums, const FeatureRows& features,
+                                      const FeatureValues& origin, int n, int count, float* predictions) {
+    const float* weight = sums + std::ptrdiff_t{colors} * (n + 1) * tile_width;
+    for (int c = 0; c < colors; ++c, predictions += tile_width) {
+        std::copy_n(sums, count, predictions);
+        sums += tile_width;
+        for (int f = 0; f < n; ++f, sums += tile_width) {
+            const auto i = static_cast<std::size_t>(f);
+            for (int x = 0; x < count; ++x) predictions[x] += sums[x] * (features[i][x] - origin[i]);
         }
-        for (int i = 0; i < count; ++i) sums[i] += weights[i] * prediction[static_cast<std::size_t>(i)];
-    }
-    for (int i = 0; i < count; ++i) sums[i] += weights[i];
-}
-
-using Matrix = std::array<std::array<double, max_features>, max_features>;
-using Vector = std::array<double, max_features>;
-
-// Factors a symmetric positive definite matrix in place, A = L L'.
-void cholesky(std::size_t n, Matrix& a) {
-    for (std::size_t i = 0; i < n; ++i) {
-        for (std::size_t j = 0; j <= i; ++j) {
-            double sum = a[i][j];
-            for (std::size_t m = 0; m < j; ++m) sum -= a[i][m] * a[j][m];
-            // Rounding can leave a pivot of 0 where features repeat one another; the ridge is its true size.
-            a[i][j] = i == j ? std::sqrt(std::max(sum, 1e-12)) : sum / a[j][j];
-        }
-    }
-}
-
-void solve_cholesky(std::size_t n, const Matrix& l, Vector& b) {
-    for (std::size_t i = 0; i < n; ++i) {
-        for (std::size_t m = 0; m < i; ++m) b[i] -= l[i][m] * b[m];
-        b[i] /= l[i][i];
-    }
-    for (std::size_t i = n; i-- > 0;) {
-        for (std::size_t m = i + 1; m < n; ++m) b[i] -= l[m][i] * b[m];
-        b[i] /= l[i][i];
+        for (int x = 0; x < count; ++x) predictions[x] /= std::max(weight[x], least_weight_sum);
     }
 }
 
@@ -159,7 +266,6 @@ class Regression {
     Regression(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
                ConstImage guide_variance, const RegressionWindow& window, int threads)
         : window_(window),
-          penalty_(penalty, penalty + features.channels),
           threads_(threads),
           guided_(guide.known()),
           target_(target, window.radius, threads),
@@ -168,7 +274,9 @@ class Regression {
                          : PaddedPlanes(0, 0, 0, 0)),
           guide_variance_(guided_ ? PaddedPlanes(guide_variance, window.radius + window.patch_radius, threads)
                                   : PaddedPlanes(0, 0, 0, 0)),
-          coefficients_(colors * (features.channels + 1), target.height, target.width, window.radius) {}
+          coefficients_(colors * (features.channels + 1), target.height, target.width, window.radius) {
+        std::copy_n(penalty, features.channels, penalty_.begin());
+    }
 
     void run(Image out) {
         for_all_tiles([&](const Tile& tile, Scratch& scratch) { fit(tile, scratch); });
@@ -177,10 +285,14 @@ class Regression {
 
   private:
     struct Scratch {
-        std::vector<float> sums;
-        std::vector<float> distances;
-        std::vector<float> row_means;
-        std::array<float, tile_pixels> weights{};
+        std::vector<float> planes;     // [row][plane][column], of the tile and the windows of its pixels
+        std::vector<float> weights;    // [row of the tile][offset in a row][column]
+        std::vector<float> sums;       // [row of the tile][plane][column]
+        std::vector<float> distances;  // [row][column], of the tile and its patches
+
+        [[nodiscard]] float* sums_of_row(int i) {
+            return sums.data() + static_cast<std::ptrdiff_t>(i) * (std::ssize(sums) / tile_height);
+        }
     };
 
     template <typename Body>
@@ -205,183 +317,149 @@ class Regression {
     // image would fall apart into grids that know nothing of each other.
     [[nodiscard]] int gather_step() const { return window_.step == 1 ? 1 : window_.step + 1; }
 
-    // Calls body(offset), with scratch.weights set, for every step-th offset of the window, the pixel itself
-    // among them, at which the tile has a neighbour.
-    template <typename Body>
-    void for_all_offsets(const Tile& tile, int step, Scratch& scratch, const Body& body) const {
+    // Leaves in scratch.sums, for every pixel of the tile, the weighted sums of `plane_count` planes over
+    // every step-th row and column of its window, the pixel itself among them. `carry(y, x, count, stride,
+    // planes)` writes the planes of the neighbours in row y from column x on.
+    template <typename Carry>
+    void sum_windows(const Tile& tile, int step, int plane_count, Scratch& scratch,
+                     const Carry& carry) const {
         const int reach = window_.radius / step * step;
+        const int offset_count = 2 * reach / step + 1;
+        const int planes = rounded_up(plane_count, planes_at_once);
+        const int stride = tile_width + 2 * reach;
+        const int first_row = std::max(tile.y - reach, 0);
+        const int end_row = std::min(tile.y + tile.height + reach, target_.height());
+        const std::ptrdiff_t size_of_row = std::ptrdiff_t{planes} * stride;
+        const std::ptrdiff_t weights_of_row = std::ptrdiff_t{offset_count} * tile_width;
+        scratch.planes.resize(static_cast<std::size_t>((end_row - first_row) * size_of_row));
+        scratch.weights.resize(static_cast<std::size_t>(tile_height * weights_of_row));
+        scratch.sums.assign(std::size_t{tile_height} * static_cast<std::size_t>(planes) * tile_width, 0);
+        for (int y = first_row; y < end_row; ++y) {
+            carry(y, tile.x - reach, tile.width + 2 * reach, stride,
+                  scratch.planes.data() + (y - first_row) * size_of_row);
+        }
         for (int dy = -reach; dy <= reach; dy += step) {
-            for (int dx = -reach; dx <= reach; dx += step) {
-                const bool any_row = tile.y + tile.height > -dy && tile.y + dy < target_.height();
-                const bool any_column = tile.x + tile.width > -dx && tile.x + dx < target_.width();
-                if (!any_row || !any_column) continue;
-                weigh(tile, {.y = dy, .x = dx}, scratch);
-                body(Offset{.y = dy, .x = dx});
+            const int first = std::max(tile.y, -dy);
+            const int end = std::min(tile.y + tile.height, target_.height() - dy);
+            if (first >= end) continue;
+            for (int k = 0; k < offset_count; ++k) {
+                weigh(tile, dy, k * step - reach, scratch,
+                      scratch.weights.data() + std::ptrdiff_t{k} * tile_width, weights_of_row);
+            }
+            for (int y = first; y < end; ++y) {
+                add_weighted(scratch.weights.data() + (y - tile.y) * weights_of_row, offset_count, step,
+                             scratch.planes.data() + (y + dy - first_row) * size_of_row, stride, planes,
+                             rounded_up(tile.width, lanes), scratch.sums_of_row(y - tile.y));
             }
         }
     }
 
-    void weigh(const Tile& tile, Offset offset, Scratch& scratch) const {
-        const auto row_of = [&](int i) {
-            return scratch.weights.data() + static_cast<std::ptrdiff_t>(i) * tile_width;
-        };
-        if (guided_) {
-            compare_guide(tile, offset, scratch);
-        } else {
-            scratch.weights.fill(0);
-        }
-        for (int i = 0; i < tile.height; ++i) {
+    // The weights of the tile's neighbours at one offset; 0 outside of the image, but for whole rows of them.
+    void weigh(const Tile& tile, int dy, int dx, Scratch& scratch, float* weights,
+               std::ptrdiff_t weights_of_row) const {
+        if (guided_) compare_guide(tile, dy, dx, scratch, weights, weights_of_row);
+        for (int i = 0; i < tile.height; ++i, weights += weights_of_row) {
             const int y = tile.y + i;
-            const int neighbour_y = y + offset.y;
-            float* weights = row_of(i);
-            if (neighbour_y < 0 || neighbour_y >= target_.height()) {
-                std::fill_n(weights, tile_width, 0.0F);
-                continue;
-            }
-            for (int f = 0; f < features_.channels(); ++f) {
-                const float penalty = penalty_[static_cast<std::size_t>(f)];
-                if (penalty <= 0) continue;
-                add_feature_distance(features_.row(f, y) + tile.x,
-                                     features_.row(f, neighbour_y) + tile.x + offset.x, penalty, tile.width,
-                                     weights);
-            }
-            weights_from_distances(tile.width, weights);
-            const int first = std::clamp(-offset.x - tile.x, 0, tile.width);
-            const int last = std::clamp(target_.width() - offset.x - tile.x, 0, tile.width);
+            if (y + dy < 0 || y + dy >= target_.height()) continue;
+            if (!guided_) std::fill_n(weights, tile_width, 0.0F);
+            weigh_row(features_.row(0, y) + tile.x, features_.row(0, y + dy) + tile.x + dx,
+                      features_.plane_size(), penalty_, features_.channels(), rounded_up(tile.width, lanes),
+                      weights);
+            const int first = std::clamp(-dx - tile.x, 0, tile.width);
+            const int last = std::clamp(target_.width() - dx - tile.x, 0, tile.width);
             std::fill(weights, weights + first, 0.0F);
             std::fill(weights + last, weights + tile.width, 0.0F);
         }
     }
 
-    // Leaves in scratch.weights the guide's distances, averaged over patches and never negative.
-    void compare_guide(const Tile& tile, Offset offset, Scratch& scratch) const {
+    // The guide's distances at one offset, averaged over patches.
+    void compare_guide(const Tile& tile, int dy, int dx, Scratch& scratch, float* distances,
+                       std::ptrdiff_t distances_of_row) const {
         const int r = window_.patch_radius;
         const int rows = tile.height + 2 * r;
-        const int columns = tile.width + 2 * r;
-        scratch.distances.assign(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns), 0);
-        scratch.row_means.resize(static_cast<std::size_t>(rows) * tile_width);
-        const float scale = 1.0F / static_cast<float>(guide_.channels());
-        for (int i = 0; i < rows; ++i) {
-            const int y = tile.y - r + i;
+        const int columns = rounded_up(tile.width + 2 * r, lanes);
+        scratch.distances.resize(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns));
+        float* row = scratch.distances.data();
+        for (int y = tile.y - r; y < tile.y + tile.height + r; ++y, row += columns) {
             // Rows beyond the margin belong to neighbours outside of the image, whose weight becomes 0.
-            const int neighbour_y = std::clamp(y + offset.y, -r, target_.height() - 1 + r);
-            float* distances = scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns;
-            for (int c = 0; c < guide_.channels(); ++c) {
-                const std::ptrdiff_t p = tile.x - r;
-                const std::ptrdiff_t q = p + offset.x;
-                add_guide_distance(guide_.row(c, y) + p, guide_.row(c, neighbour_y) + q,
-                                   guide_variance_.row(c, y) + p, guide_variance_.row(c, neighbour_y) + q,
-                                   window_.k * window_.k, scale, columns, distances);
-            }
-            sliding_mean(distances, 2 * r + 1, 1, tile.width,
-                         scratch.row_means.data() + static_cast<std::ptrdiff_t>(i) * tile_width);
+            const int neighbour_y = std::clamp(y + dy, -r, target_.height() - 1 + r);
+            const std::ptrdiff_t p = tile.x - r;
+            const std::ptrdiff_t q = p + dx;
+            compare_rows(guide_.row(0, y) + p, guide_.row(0, neighbour_y) + q, guide_variance_.row(0, y) + p,
+                         guide_variance_.row(0, neighbour_y) + q, guide_.plane_size(), guide_.channels(),
+                         window_.k * window_.k, columns, row);
         }
         for (int i = 0; i < tile.height; ++i) {
-            float* distances = scratch.weights.data() + static_cast<std::ptrdiff_t>(i) * tile_width;
-            sliding_mean(scratch.row_means.data() + static_cast<std::ptrdiff_t>(i) * tile_width, 2 * r + 1,
-                         tile_width, tile.width, distances);
-            for (int j = 0; j < tile.width; ++j) distances[j] = std::max(distances[j], 0.0F);
+            average_patches(scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns, 2 * r + 1,
+                            columns, tile.width, distances + i * distances_of_row);
         }
     }
 
-    [[nodiscard]] std::array<const float*, max_features> feature_rows(int y, int x) const {
-        std::array<const float*, max_features> rows{};
+    [[nodiscard]] FeatureRows feature_rows(int y, int x) const {
+        FeatureRows rows{};
         for (int f = 0; f < features_.channels(); ++f)
             rows[static_cast<std::size_t>(f)] = features_.row(f, y) + x;
         return rows;
     }
 
-    void fit(const Tile& tile, Scratch& scratch) {
-        const int n = features_.channels();
-        const int sum_count = (n + 1) * (n + 2) / 2 + colors * (n + 1);
-        scratch.sums.assign(static_cast<std::size_t>(sum_count) * tile_pixels, 0);
-        for_all_offsets(tile, window_.step, scratch, [&](Offset offset) {
-            for (int i = 0; i < tile.height; ++i) {
-                const int y = tile.y + i;
-                const int neighbour_y = y + offset.y;
-                if (neighbour_y < 0 || neighbour_y >= target_.height()) continue;
-                const int neighbour_x = tile.x + offset.x;
-                const std::array<const float*, colors> target{target_.row(0, neighbour_y) + neighbour_x,
-                                                              target_.row(1, neighbour_y) + neighbour_x,
-                                                              target_.row(2, neighbour_y) + neighbour_x};
-                const std::ptrdiff_t first = static_cast<std::ptrdiff_t>(i) * tile_width;
-                add_to_normal_equations(scratch.weights.data() + first, feature_rows(y, tile.x),
-                                        feature_rows(neighbour_y, neighbour_x), target, n, tile.width,
-                                        scratch.sums.data() + first);
-            }
-        });
-        for (int i = 0; i < tile.height; ++i) {
-            for (int j = 0; j < tile.width; ++j) {
-                solve(scratch.sums.data() + static_cast<std::ptrdiff_t>(i) * tile_width + j, tile.y + i,
-                      tile.x + j);
-            }
+    // The features of the tile's middle.
+    [[nodiscard]] FeatureValues origin_of(const Tile& tile) const {
+        FeatureValues origin{};
+        for (int f = 0; f < features_.channels(); ++f) {
+            origin[static_cast<std::size_t>(f)] =
+                features_.row(f, tile.y + tile.height / 2)[tile.x + tile.width / 2];
         }
+        return origin;
     }
 
-    // Solves one pixel's normal equations, whose sums lie tile_pixels apart, and keeps its coefficients.
-    void solve(const float* sums, int y, int x) {
-        const auto n = static_cast<std::size_t>(features_.channels());
-        const double scale = 1.0 / std::max(*sums, least_weight_sum);
-        const auto next = [&] {
-            sums += tile_pixels;
-            return scale * static_cast<double>(*sums);
-        };
-        Vector mean{};
-        Matrix covariance{};
-        for (std::size_t f = 0; f < n; ++f) mean[f] = next();
-        for (std::size_t f = 0; f < n; ++f) {
-            for (std::size_t g = f; g < n; ++g) covariance[g][f] = next() - mean[f] * mean[g];
-            covariance[f][f] = std::max(covariance[f][f], 0.0) + static_cast<double>(window_.ridge);
-        }
-        cholesky(n, covariance);
-        int plane = 0;
-        for (int c = 0; c < colors; ++c) {
-            const double mean_color = next();
-            Vector slope{};
-            for (std::size_t f = 0; f < n; ++f) slope[f] = next() - mean[f] * mean_color;
-            solve_cholesky(n, covariance, slope);
-            double constant = mean_color;
-            for (std::size_t f = 0; f < n; ++f) constant -= slope[f] * mean[f];
-            coefficients_.row(plane++, y)[x] = static_cast<float>(constant);
-            for (std::size_t f = 0; f < n; ++f)
-                coefficients_.row(plane++, y)[x] = static_cast<float>(slope[f]);
+    void fit(const Tile& tile, Scratch& scratch) {
+        const int n = features_.channels();
+        const FeatureValues origin = origin_of(tile);
+        sum_windows(tile, window_.step, (n + 1) * (n + 2) / 2 + colors * (n + 1), scratch,
+                    [&](int y, int x, int count, int stride, float* planes) {
+                        carry_products(feature_rows(y, x), origin, n,
+                                       {target_.row(0, y) + x, target_.row(1, y) + x, target_.row(2, y) + x},
+                                       count, stride, planes);
+                    });
+        const double ridge = std::max(static_cast<double>(window_.ridge), 1e-12);
+        for (int i = 0; i < tile.height; ++i) {
+            for (int j = 0; j < tile.width; j += systems) {
+                const int y = tile.y + i;
+                const int x = tile.x + j;
+                fit_pixels(scratch.sums_of_row(i) + j, feature_rows(y, x), origin,
+                           static_cast<std::size_t>(n), ridge, std::min(systems, tile.width - j),
+                           coefficients_.row(0, y) + x, coefficients_.plane_size());
+            }
         }
     }
 
     void gather(const Tile& tile, Scratch& scratch, Image out) const {
         const int n = features_.channels();
-        scratch.sums.assign(std::size_t{colors + 1} * tile_pixels, 0);
+        const FeatureValues origin = origin_of(tile);
         std::vector<const float*> coefficients(static_cast<std::size_t>(coefficients_.channels()));
-        for_all_offsets(tile, gather_step(), scratch, [&](Offset offset) {
-            for (int i = 0; i < tile.height; ++i) {
-                const int y = tile.y + i;
-                const int neighbour_y = y + offset.y;
-                if (neighbour_y < 0 || neighbour_y >= target_.height()) continue;
-                const int neighbour_x = tile.x + offset.x;
-                for (int plane = 0; plane < coefficients_.channels(); ++plane) {
-                    coefficients[static_cast<std::size_t>(plane)] =
-                        coefficients_.row(plane, neighbour_y) + neighbour_x;
-                }
-                const std::ptrdiff_t first = static_cast<std::ptrdiff_t>(i) * tile_width;
-                add_predictions(scratch.weights.data() + first, feature_rows(y, tile.x),
-                                feature_rows(neighbour_y, neighbour_x), coefficients.data(), n, tile.width,
-                                scratch.sums.data() + first);
-            }
-        });
+        sum_windows(tile, gather_step(), coefficients_.channels() + 1, scratch,
+                    [&](int y, int x, int count, int stride, float* planes) {
+                        for (int plane = 0; plane < coefficients_.channels(); ++plane)
+                            coefficients[static_cast<std::size_t>(plane)] = coefficients_.row(plane, y) + x;
+                        carry_coefficients(feature_rows(y, x), origin, n, coefficients.data(), count, stride,
+                                           planes);
+                    });
+        std::array<float, std::size_t{colors} * tile_width> predictions{};
         for (int i = 0; i < tile.height; ++i) {
+            const int y = tile.y + i;
+            predict_row(scratch.sums_of_row(i), feature_rows(y, tile.x), origin, n, tile.width,
+                        predictions.data());
             for (int j = 0; j < tile.width; ++j) {
-                const float* sums = scratch.sums.data() + static_cast<std::ptrdiff_t>(i) * tile_width + j;
-                const float weight = std::max(sums[std::ptrdiff_t{colors} * tile_pixels], least_weight_sum);
                 for (int c = 0; c < colors; ++c) {
-                    out.at(tile.y + i, tile.x + j, c) =
-                        sums[static_cast<std::ptrdiff_t>(c) * tile_pixels] / weight;
+                    out.at(y, tile.x + j, c) =
+                        predictions[static_cast<std::size_t>(c) * tile_width + static_cast<std::size_t>(j)];
                 }
             }
         }
     }
 
     RegressionWindow window_;
-    std::vector<float> penalty_;
+    FeatureValues penalty_{};
     int threads_;
     bool guided_;
     PaddedPlanes target_;
