@@ -9,6 +9,7 @@
 
 #include "core.hpp"
 #include "exp_minus.hpp"
+#include "fastest.hpp"
 
 namespace tungsten_dip {
 namespace {
@@ -131,7 +132,6 @@ class TileFilter {
     std::vector<HalvesRow<tile_size>> sums_;        // [channel][row] weight * (value at the offset - value)
     std::vector<HalvesRow<tile_size>> weights_;     // [row] sum of the weights, half a's from b's patches
     std::vector<HalvesRow<tile_size>> patch_rows_;  // [padded row] distances summed over a patch's columns
-    HalvesRow<padded_size> distances_;
 
     [[nodiscard]] std::size_t tile_row(int y) const { return static_cast<std::size_t>(y - rows_.begin); }
     [[nodiscard]] std::size_t padded_row(int y) const { return tile_row(y) + patch_radius; }
@@ -157,8 +157,7 @@ class TileFilter {
         const Range padded_rows = rows_.grown(patch_radius).clipped(valid_rows);
         const Range padded_columns = columns_.grown(patch_radius).clipped(valid_columns);
         for (int y = padded_rows.begin; y < padded_rows.end; ++y) {
-            measure_row(y, dy, dx, padded_columns);
-            sum_columns(patch_rows_[padded_row(y)]);
+            measure_row(y, dy, dx, padded_columns, patch_rows_[padded_row(y)]);
         }
         for (int y = rows.begin; y < rows.end; ++y) {
             add_row(y, dy, dx, columns,
@@ -166,15 +165,15 @@ class TileFilter {
         }
     }
 
-    // The distances of a row's pixels to their partners, after Rousselle et al. 2012: squared
-    // differences less what noise alone makes of them, over the variance, averaged over channels.
-    void measure_row(int y, int dy, int dx, Range columns) {
-        distances_ = {};
+    // The distances of a row's pixels to their partners, after Rousselle et al. 2012: squared differences
+    // less what noise alone makes of them, over the variance, averaged over channels, then summed over the
+    // columns of patches.
+    TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, Range columns,
+                                          HalvesRow<tile_size>& out) const {
+        HalvesRow<padded_size> distances;
         const int first = columns.begin;
-        const int count = columns.end - columns.begin;
-        const int padding = columns.begin - columns_.begin + patch_radius;
-        float* distance_a = distances_.a.data() + padding;
-        float* distance_b = distances_.b.data() + padding;
+        const auto begin = static_cast<std::size_t>(columns.begin - columns_.begin) + patch_radius;
+        const auto end = static_cast<std::size_t>(columns.end - columns_.begin) + patch_radius;
         const float share = 1.0F / static_cast<float>(feature_.a.channels);
         for (int c = 0; c < feature_.a.channels; ++c) {
             const float* a = feature_.a.row(c, y) + first;
@@ -183,27 +182,25 @@ class TileFilter {
             const float* a_there = feature_.a.row(c, y + dy) + first + dx;
             const float* b_there = feature_.b.row(c, y + dy) + first + dx;
             const float* variance_there = feature_.variance.row(c, y + dy) + first + dx;
-            for (int i = 0; i < count; ++i) {
-                const float noise = variance[i] + std::min(variance[i], variance_there[i]);
-                const float scale = share / (k_squared * (variance[i] + variance_there[i]) + epsilon);
-                const float difference_a = a[i] - a_there[i];
-                const float difference_b = b[i] - b_there[i];
-                distance_a[i] += std::min((difference_a * difference_a - noise) * scale, largest_distance);
-                distance_b[i] += std::min((difference_b * difference_b - noise) * scale, largest_distance);
+            for (std::size_t i = begin; i < end; ++i) {
+                const std::size_t j = i - begin;
+                const float noise = variance[j] + std::min(variance[j], variance_there[j]);
+                const float scale = share / (k_squared * (variance[j] + variance_there[j]) + epsilon);
+                const float difference_a = a[j] - a_there[j];
+                const float difference_b = b[j] - b_there[j];
+                distances.a[i] += std::min((difference_a * difference_a - noise) * scale, largest_distance);
+                distances.b[i] += std::min((difference_b * difference_b - noise) * scale, largest_distance);
             }
         }
-    }
-
-    void sum_columns(HalvesRow<tile_size>& out) const {
         out = {};
         for (std::size_t tap = 0; tap < patch_size; ++tap) {
-            for (std::size_t i = 0; i < tile_size; ++i) out.a[i] += distances_.a[i + tap];
-            for (std::size_t i = 0; i < tile_size; ++i) out.b[i] += distances_.b[i + tap];
+            for (std::size_t i = 0; i < tile_size; ++i) out.a[i] += distances.a[i + tap];
+            for (std::size_t i = 0; i < tile_size; ++i) out.b[i] += distances.b[i + tap];
         }
     }
 
-    void add_row(int y, int dy, int dx, Range columns, Range patch,
-                 const std::array<float, tile_size>& patch_width) {
+    TUNGSTEN_DIP_FASTEST void add_row(int y, int dy, int dx, Range columns, Range patch,
+                                      const std::array<float, tile_size>& patch_width) {
         HalvesRow<tile_size> weight;
         for (int row = patch.begin; row < patch.end; ++row) {
             const auto& distance = patch_rows_[padded_row(row)];
