@@ -24,6 +24,9 @@ constexpr float reach = 2.5F;
 
 constexpr float least_trace = 1e-12F;
 
+// Penalty of the squared relative difference between the structure tensors of two pixels.
+constexpr float other_edge_penalty = 1.5F;
+
 template <int radius>
 using Kernel = std::array<float, 2 * std::size_t{radius} + 1>;
 
@@ -70,8 +73,8 @@ void convolve(const PaddedPlanes& in, int channel, const Kernel<radius>& along_r
 }
 
 // The products of the features' gradients, summed over features and smoothed: channels xx, yy, xy (Foerstner
-// and Guelch 1987).
-PaddedPlanes structure_tensor(ConstImage features, int threads) {
+// and Guelch 1987). Padded by `edge` pixels.
+PaddedPlanes structure_tensor(ConstImage features, int edge, int threads) {
     const PaddedPlanes planes(features, derivative_radius, threads);
     const auto smooth = gaussian<derivative_radius>(derivative_sigma);
     const auto derivative = gaussian_derivative<derivative_radius>(derivative_sigma);
@@ -92,22 +95,35 @@ PaddedPlanes structure_tensor(ConstImage features, int threads) {
         .data = products.data(), .height = features.height, .width = features.width, .channels = 3};
     const PaddedPlanes padded(image, tensor_radius, threads);
     const auto window = gaussian<tensor_radius>(tensor_sigma);
-    PaddedPlanes tensor(3, features.height, features.width, 0);
+    std::vector<float> tensor(products.size());
     std::vector<float> smoothed;
-    for (int c = 0; c < 3; ++c) {
-        convolve<tensor_radius>(padded, c, window, window, threads, smoothed);
-        std::ranges::copy(smoothed, tensor.row(c, 0));
+    for (std::size_t c = 0; c < 3; ++c) {
+        convolve<tensor_radius>(padded, static_cast<int>(c), window, window, threads, smoothed);
+        for (std::size_t i = 0; i < smoothed.size(); ++i) tensor[3 * i + c] = smoothed[i];
     }
-    return tensor;
+    const ConstImage joined{
+        .data = tensor.data(), .height = features.height, .width = features.width, .channels = 3};
+    return {joined, edge, threads};
 }
 
-// What one row's Gaussians are made of: the unit vectors across the edges, and 1 / (2 sigma^2) along them.
+struct TensorRow {
+    const float* xx;
+    const float* yy;
+    const float* xy;
+
+    TensorRow(const PaddedPlanes& tensor, int y, int dx)
+        : xx(tensor.row(0, y) + dx), yy(tensor.row(1, y) + dx), xy(tensor.row(2, y) + dx) {}
+};
+
+// What one row's Gaussians are made of: the unit vectors across the edges, 1 / (2 sigma^2) along them, and
+// the penalty of differences between tensors.
 struct Gaussians {
     std::vector<float> normal_x;
     std::vector<float> normal_y;
     std::vector<float> along;
+    std::vector<float> penalty;
 
-    explicit Gaussians(std::size_t count) : normal_x(count), normal_y(count), along(count) {}
+    explicit Gaussians(std::size_t count) : normal_x(count), normal_y(count), along(count), penalty(count) {}
 };
 
 // Where there is no single direction, as at corners, the Gaussian shrinks to the width that it has across.
@@ -117,23 +133,32 @@ void find_gaussians(const PaddedPlanes& tensor, int y, float along, float across
         const float yy = tensor.row(1, y)[x];
         const float xy = tensor.row(2, y)[x];
         const float angle = 0.5F * std::atan2(2 * xy, xx - yy);
-        const float coherence =
-            std::sqrt((xx - yy) * (xx - yy) + 4 * xy * xy) / std::max(xx + yy, least_trace);
+        const float trace = std::max(xx + yy, least_trace);
+        const float coherence = std::sqrt((xx - yy) * (xx - yy) + 4 * xy * xy) / trace;
         const float sigma = std::max(along * coherence * coherence, across);
         const auto i = static_cast<std::size_t>(x);
         out.normal_x[i] = std::cos(angle);
         out.normal_y[i] = std::sin(angle);
         out.along[i] = 0.5F / (sigma * sigma);
+        out.penalty[i] = other_edge_penalty / (trace * trace);
     }
 }
 
-TUNGSTEN_DIP_FASTEST void weigh_offset(const float* normal_x, const float* normal_y, const float* along,
-                                       float dx, float dy, float across, int count, float* weights) {
+// The line that an edge follows goes on where the edge itself ends: the difference of the tensors tells.
+TUNGSTEN_DIP_FASTEST void weigh_offset(const Gaussians& gaussians, const TensorRow& tensor,
+                                       const TensorRow& other, float dx, float dy, float across,
+                                       float* weights) {
     const float across_scale = 0.5F / (across * across);
     const float distance = dx * dx + dy * dy;
-    for (int x = 0; x < count; ++x) {
-        const float v = normal_x[x] * dx + normal_y[x] * dy;
-        weights[x] = exp_minus(std::max((distance - v * v) * along[x], 0.0F) + v * v * across_scale);
+    const std::size_t count = gaussians.along.size();
+    for (std::size_t x = 0; x < count; ++x) {
+        const float v = gaussians.normal_x[x] * dx + gaussians.normal_y[x] * dy;
+        const float xx = tensor.xx[x] - other.xx[x];
+        const float yy = tensor.yy[x] - other.yy[x];
+        const float xy = tensor.xy[x] - other.xy[x];
+        weights[x] =
+            exp_minus(std::max((distance - v * v) * gaussians.along[x], 0.0F) + v * v * across_scale +
+                      (xx * xx + yy * yy + 2 * xy * xy) * gaussians.penalty[x]);
     }
 }
 
@@ -147,8 +172,8 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
                         int threads) {
     if (!(along > 0) || !(across > 0)) throw std::invalid_argument("along and across must be above 0");
     if (image.size() == 0) return;
-    const PaddedPlanes tensor = structure_tensor(features, threads);
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
+    const PaddedPlanes tensor = structure_tensor(features, radius, threads);
     const PaddedPlanes planes(image, radius, threads);
     const int width = image.width;
     parallel_for(image.height, threads, [&](int y) {
@@ -162,8 +187,8 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
         find_gaussians(tensor, y, along, across, gaussians);
         for (int dy = -radius; dy <= radius; ++dy) {
             for (int dx = -radius; dx <= radius; ++dx) {
-                weigh_offset(gaussians.normal_x.data(), gaussians.normal_y.data(), gaussians.along.data(),
-                             static_cast<float>(dx), static_cast<float>(dy), across, width, weights.data());
+                weigh_offset(gaussians, TensorRow(tensor, y, 0), TensorRow(tensor, y + dy, dx),
+                             static_cast<float>(dx), static_cast<float>(dy), across, weights.data());
                 for (int c = 0; c < image.channels; ++c) {
                     add_weighted(weights.data(), planes.row(c, y + dy) + dx, width,
                                  sums[static_cast<std::size_t>(c)].data());

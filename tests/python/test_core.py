@@ -247,6 +247,9 @@ def test_smoothing_along_edges_leaves_corners_and_constants() -> None:
     smooth = _core.smooth_along_edges(corner, corner, along=3, across=0.3)
     assert smooth[15, 15, 0] > 4
     assert smooth[14, 14, 0] < 0.5
+    # The line of an edge goes on beyond its end.
+    smooth = _core.smooth_along_edges(corner, corner, along=8, across=0.3)
+    assert smooth[18:, 18:].min() > 4.7
     constant = np.full((9, 13, 3), 2.5, np.float32)
     for features in (constant, corner[:9, :13].copy(), np.empty((9, 13, 0), np.float32)):
         smooth = _core.smooth_along_edges(constant, features, along=3, across=0.3)

@@ -70,7 +70,7 @@ FIRST_GUIDE = Pilot(radius=3)
 FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
 """Where no feature shows an edge, a window blurs every one within it."""
 
-EDGES = Pilot(3, along_edges=True)
+EDGES = Pilot(6, along_edges=True)
 
 # In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
 # shadows and reflections, which no feature shows; a regression on the position follows gradients.
