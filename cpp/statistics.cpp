@@ -135,9 +135,15 @@ Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
 // sample variance has expectation 1 in every pixel and is bounded, and a plain mean over pixels is safe.
 
 // Below sixteen of half floats' smallest steps, and where noise is under 2^-9 of the radiance (the step is
-// 2^-11), rounding distorts the ratio by more than a percent.
-constexpr double smallest_variance = 0x1p-20;
+// 2^-11), rounding distorts the ratio by more than a percent. What is no multiple of the smallest step was
+// not rounded to it.
+constexpr double smallest_half = 0x1p-24;
 constexpr double smallest_deviation = 0x1p-9;
+
+bool rounded_to_few_digits(double variance) {
+    const double steps = variance / smallest_half;
+    return steps <= 16 && steps == std::floor(steps);
+}
 
 // The ratio's standard deviation; at most 1.4 (that of a chi-squared variable), 0.8 to 1.2 was measured.
 constexpr double ratio_spread = 1.4;
@@ -164,7 +170,7 @@ Ratio measure_ratio(ConstImage a, ConstImage b, ConstImage variance, int threads
             const double value_b = b.row(y)[i];
             const double sample_variance = variance.row(y)[i];
             const double floor = smallest_deviation * (value_a + value_b) / 2;
-            if (!(sample_variance > std::max(smallest_variance, floor * floor))) continue;
+            if (!(sample_variance > floor * floor) || rounded_to_few_digits(sample_variance)) continue;
             sum.ratio += (value_a - value_b) * (value_a - value_b) / 4 / sample_variance;
             ++sum.count;
         }
