@@ -6,6 +6,7 @@ Every case damages a small synthetic render whose truth is known. `test_hard_cas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,6 +25,8 @@ REACH = 9
 """Pixels that a window of the filter reaches; good ones farther from every bad one must not notice it."""
 
 MOST_DRIFT = 0.01
+"""Or the standard error of the input's own mean, where that is larger: the mean is not known any better."""
+
 INVISIBLE = 1e-4
 """A relMSE that nobody sees: an error of 1% of the radiance."""
 
@@ -35,7 +38,8 @@ MOST_HARM = 1.5
 
 PROMISES = {
     "finite": "every value of the image and of its error map is finite and none is negative",
-    "mean": "the mean radiance of pixels out of reach of the damage is within 1% of the input's",
+    "mean": "the mean radiance of pixels out of reach of the damage is within 1% of the input's, or within "
+    "the standard error of that",
     "error": "the error of undamaged pixels is no larger than the input's, or below 1e-4",
     "harm": "out of reach of the damage, the error is at most 1.5 times that without the damage",
     "seed": "the same seed gives the same bits again",
@@ -68,6 +72,7 @@ class Outcome:
 
     finite: bool
     drift: float | None = None
+    most_drift: float = MOST_DRIFT
     error: float | None = None
     input_error: float | None = None
     harm: float | None = None
@@ -77,7 +82,7 @@ class Outcome:
         broken = {}
         if not self.finite:
             broken["finite"] = "finite"
-        if self.drift is not None and not abs(self.drift) <= MOST_DRIFT:
+        if self.drift is not None and not abs(self.drift) <= self.most_drift:
             broken["mean"] = f"mean {self.drift:+.1%}"
         most = None if self.input_error is None else max(self.input_error, INVISIBLE)
         if self.error is not None and most is not None and not self.error <= most:
@@ -98,13 +103,18 @@ def measure(result: FitResult, damaged: Damaged, undamaged: FitResult | None = N
     truth, noisy = damaged.reference, sanitize(damaged.buffers)[0].color.mean
     good, far = ~damaged.bad, out_of_reach(damaged.bad)
     drift = harm = None
+    most_drift = MOST_DRIFT
     if far.mean() > LEAST_FAR and noisy[far].max() > 0:
         drift = float(color[far].mean(dtype=np.float64) / noisy[far].mean(dtype=np.float64) - 1)
+        noise = (noisy[far] - truth[far]).astype(np.float64)
+        most_drift = max(
+            MOST_DRIFT, math.sqrt(float((noise**2).sum())) / float(noisy[far].sum(dtype=np.float64))
+        )
     if undamaged is not None and far.mean() > LEAST_FAR and damaged.bad.any():
         harm = rel_mse(color, truth, far) / rel_mse(undamaged.color, truth, far)
     if not good.any():
-        return Outcome(True, drift)
-    return Outcome(True, drift, rel_mse(color, truth, good), rel_mse(noisy, truth, good), harm)
+        return Outcome(True, drift, most_drift)
+    return Outcome(True, drift, most_drift, rel_mse(color, truth, good), rel_mse(noisy, truth, good), harm)
 
 
 def rel_mse(image: FloatImage, reference: FloatImage, where: npt.NDArray[np.bool_]) -> float:
@@ -377,7 +387,6 @@ _NO_EDGES = {
     "mean": "edges that no feature shows are found in the noisy colour itself, which darkens small images"
 }
 _BEYOND = {"exposure": "exposures are undone up to 2^100"}
-_FEW_PIXELS = {"mean": "so few noisy pixels do not tell the mean to within 1%"}
 _EMITTED = {"exposure": "albedo above 1 is light that a surface emits, in the renderer's units"}
 
 
@@ -450,8 +459,7 @@ def _cases() -> Iterator[HardCase]:
     yield HardCase(group, "albedo 1e30 in one pixel", _feature("albedo", _one_wild), _EMITTED)
 
     for height, width in ((1, 1), (1, 64), (64, 1), (5, 7), (65, 33), (1000, 31), (16, 8192), (4096, 1)):
-        known = _FEW_PIXELS if height * width < 1000 else {}
-        yield HardCase("Sizes", f"{width}x{height}", lambda h=height, w=width: healthy(h, w), known)
+        yield HardCase("Sizes", f"{width}x{height}", lambda h=height, w=width: healthy(h, w))
 
 
 def _black_on_the_left(image: FloatImage, _: Damaged) -> FloatImage:

@@ -30,7 +30,7 @@ from tungsten_dip.fit.evidence import (
 )
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
-from tungsten_dip.fit.training import Examples, examples_from_evidence, first_weights
+from tungsten_dip.fit.training import Examples, first_weights, start_of_training
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import infer, inference, load_model, save_model
 from tungsten_dip.onnx.file import proto_from_model
@@ -699,6 +699,31 @@ def test_a_warm_start_ends_when_the_error_falls_no_further(
     assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
 
 
+@pytest.mark.parametrize("by", ["torch", "onnxruntime"])
+def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
+    by: str, model: Model, frame: SyntheticRender
+) -> None:
+    albedo = frame.buffers.albedo
+    assert albedo is not None
+    light = Buffer(*(20 * plane for _, plane in albedo.planes()))
+    unlike = frame.buffers.with_quantities(albedo=light)
+    if by == "torch":
+        result = denoise(unlike, replace(DRAFT, iterations=20), warm_start=model)
+        # Only which pilot the others are compared with is the model's own.
+        cold = denoise(unlike, replace(DRAFT, iterations=20))
+        np.testing.assert_allclose(result.color, cold.color, rtol=1e-3, atol=1e-4)
+    else:
+        result = infer(model, unlike, threads=1, refit_steps=20)
+    assert "the model knows no such images: a network is fitted anew" in result.notes
+    assert result.iterations == 20
+    assert result.model is not None
+    assert result.model.standardisation is not None
+    assert model.standardisation is not None
+    assert not np.array_equal(result.model.standardisation.mean, model.standardisation.mean)
+    # What is written is a model that can be used.
+    assert np.isfinite(infer(result.model, unlike, threads=1).color).all()
+
+
 def test_a_paper_network_starts_from_the_weights(frame: SyntheticRender) -> None:
     fit = paper_model("resnet", frame.buffers)
     again = denoise(frame.buffers, replace(fit.settings, iterations=1), warm_start=fit)
@@ -736,11 +761,7 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
     evidence = evidence_of(synthetic_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
-
-    def standardised(inputs: Any) -> Standardisation:
-        return Standardisation(inputs.mean((0, 1), np.float64), inputs.std((0, 1)) + np.float32(1e-3))
-
-    return examples_from_evidence(evidence, standardised)[0], evidence.layout
+    return start_of_training(evidence, seed).examples, evidence.layout
 
 
 @pytest.mark.parametrize("pixels", [1, 37, 480])

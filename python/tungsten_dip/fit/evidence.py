@@ -34,6 +34,7 @@ from tungsten_dip.fit.pilots import (
     pilot_images,
 )
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.yielding import with_what_was_lost
 from tungsten_dip.progress import Progress
 
 Array = npt.NDArray[np.float32]
@@ -48,6 +49,9 @@ _TYPICAL_RADIANCE = 0.25
 
 _BRIGHTEST = 1e15
 """Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
+
+_LARGEST_ERROR = 1e30
+"""Larger relative squared errors count as this large: their sums overflow."""
 
 _ONLY_PILOT = Pilot(9, k=1.0)
 """Used alone where nothing can score the pilots."""
@@ -240,7 +244,7 @@ def evidence_from_buffers(
             progress(0.2, "features")
             guides, irradiances, noise = first_pilots(colors, variance, guidance)
             (image,) = pilot_images(_ONLY_PILOT, colors, irradiances, guides, noise, guidance)
-            image /= np.float32(scale)
+            image = _unscaled(image, scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
         history = (HistoryPoint(seconds, 0, None),)
@@ -285,13 +289,34 @@ def evidence_from_buffers(
     denominators = _denominators(images[len(described)])
     errors = [_errors(pilot, halves, denominators) for pilot in images]
     if layout is None:
-        mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
-        best = 1 + int(np.argmin(mean_errors))
-        layout = Layout(guidance[0].names, described, len(images) - 1 - len(described), reference=best)
-    noise_a, noise_b = (
-        mean_around(_capped(error, threads), _NOISE_RADIUS, threads) for error in errors[layout.reference]
+        candidate_count = len(images) - 1 - len(described)
+        layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
+    noises = _noises(errors[layout.reference], threads)
+    return Evidence(scale, mean, guidance, layout, tuple(images), noises, tuple(notes))
+
+
+def with_best_reference(evidence: Evidence) -> Evidence:
+    """Return the same evidence with the pilots compared with the one that is best on this image."""
+    denominators = _denominators(evidence.smooth)
+    errors = [_errors(pilot, evidence.halves, denominators) for pilot in evidence.pilots]
+    layout = replace(evidence.layout, reference=_best_pilot(errors))
+    return replace(
+        evidence, layout=layout, noises=_noises(errors[layout.reference], evidence.guidance[0].threads)
     )
-    return Evidence(scale, mean, guidance, layout, tuple(images), (noise_a, noise_b), tuple(notes))
+
+
+def _best_pilot(errors: Sequence[Halves]) -> int:
+    mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
+    return 1 + int(np.argmin(mean_errors))
+
+
+def _noises(errors_of_reference: Halves, threads: int) -> Halves:
+    a, b = (
+        # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
+        np.maximum(mean_around(_capped(error, threads), _NOISE_RADIUS, threads), 0)
+        for error in errors_of_reference
+    )
+    return a, b
 
 
 def loss_weights(evidence: Evidence) -> Halves:
@@ -395,12 +420,13 @@ def estimate_error(
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
         relative = 1 / (output[part] ** 2 + epsilon)
-        apart = [
-            (((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2) * relative).mean(axis=1)
-            for a, b in pilots
-        ]
-        variance[part] = (squared[part] * relative).mean(axis=1)
-        bias[part] = np.float32(_BIAS) * np.median(apart, axis=0)
+        with np.errstate(over="ignore"):
+            apart = [
+                (((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2) * relative).mean(axis=1)
+                for a, b in pilots
+            ]
+            variance[part] = np.minimum((squared[part] * relative).mean(axis=1), _LARGEST_ERROR)
+            bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
     told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
@@ -409,7 +435,13 @@ def estimate_error(
 
 def _epsilon_of_renderer(scale: float) -> np.float32:
     """0.01 in the renderer's units, squared differences of which are scaled twice; bounded for float32."""
-    return np.float32(min(RELMSE_EPSILON * scale**2, 1e30))
+    return np.float32(min(max(RELMSE_EPSILON * scale**2, 1e-30), 1e30))
+
+
+def _relative(squared: Array, denominator: Array) -> Array:
+    with np.errstate(over="ignore"):
+        relative: Array = np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
+    return relative
 
 
 def held_out_error(
@@ -441,7 +473,7 @@ def _told_by_halves(
     """
     a, b = (image.reshape(-1, 3)[pixels] for image in witnesses)
     crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
-    error = (crossed / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)).mean(axis=1)
+    error = _relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon).mean(axis=1)
     spread = float(error.std(dtype=np.float64))
     return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
 
@@ -458,13 +490,14 @@ def result_from_fused(
     """Make the result of what the network made of each half, or of the input if that is as good."""
     threads = evidence.guidance[0].threads
     shape = fused[0].shape
+    fused = with_what_was_lost(evidence.halves, fused)
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
     image = np.float32(0.5) * (fused[0] + fused[1])
     error = estimate_error(evidence, fused_a, fused_b).reshape(*shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
-    squared = (half_a - half_b) ** 2 / 4
+    squared: Array = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
     told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, slice(None), np.float32(RELMSE_EPSILON))
@@ -472,16 +505,15 @@ def result_from_fused(
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, fused = evidence.mean, evidence.halves
         epsilon = _epsilon_of_renderer(evidence.scale)
-        error = (squared / (image**2 + epsilon)).mean(axis=2, keepdims=True)
-    unscale = np.float32(evidence.scale)
+        error = _relative(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
     return FitResult(
-        color=image / unscale,
+        color=_unscaled(image, evidence.scale),
         settings=settings,
         seconds=time.perf_counter() - started,
         iterations=iterations,
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),
-        halves=(fused[0] / unscale, fused[1] / unscale),
+        halves=(_unscaled(fused[0], evidence.scale), _unscaled(fused[1], evidence.scale)),
         history=tuple(history),
         notes=tuple(notes),
     )
@@ -548,6 +580,13 @@ def _scaled(image: FloatImage, scale: float) -> FloatImage:
     brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
     scaled: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
     return scaled
+
+
+def _unscaled(image: FloatImage, scale: float) -> FloatImage:
+    largest = float(np.finfo(np.float32).max)
+    bounded: FloatImage = np.minimum(image, np.float32(min(largest * scale, largest)))
+    bounded /= np.float32(scale)
+    return bounded
 
 
 def _denominators(smooth: Halves) -> Halves:

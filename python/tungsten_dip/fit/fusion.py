@@ -23,7 +23,6 @@ from tungsten_dip.fit.evidence import (
     Indices,
     evidence_from_buffers,
     result_from_fused,
-    standardisation_of,
 )
 from tungsten_dip.fit.model import Model, Weights, check_settings, source_sha256
 from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, FOLLOWING_PILOTS, Pilot
@@ -33,8 +32,7 @@ from tungsten_dip.fit.training import (
     ADAM_EPSILON,
     LEAKY_SLOPE,
     Examples,
-    examples_from_evidence,
-    first_weights,
+    start_of_training,
     train,
 )
 from tungsten_dip.progress import Progress, silent
@@ -73,22 +71,16 @@ def fit_fusion(
     evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):
         return evidence
-    known = None if warm_start is None else warm_start.standardisation
-    examples, standardisation = examples_from_evidence(
-        evidence, standardisation_of if known is None else lambda _: known
-    )
+    start = start_of_training(evidence, settings.seed, warm_start)
     # The network is too small to share: on a busy machine threads would only wait for one another.
     with compute_device(settings, most_threads=1) as device:
-        weights = first_weights(evidence.layout, settings.seed) if warm_start is None else warm_start.weights
-        network = _TorchNetwork(weights, examples, device)
+        network = _TorchNetwork(start.weights, start.examples, device)
         steps = settings.iterations or preset.steps
-        training = train(
-            network, examples, evidence, settings, steps, started, progress, warm=warm_start is not None
-        )
+        training = train(network, start, settings, steps, started, progress)
         fused = network.fuse_all(0), network.fuse_all(1)
     shape = evidence.mean.shape
     result = result_from_fused(
-        evidence,
+        start.evidence,
         (fused[0].reshape(shape), fused[1].reshape(shape)),
         settings,
         started,
@@ -98,13 +90,13 @@ def fit_fusion(
     )
     model = Model(
         kind="pointwise",
-        planes=evidence.layout.planes,
+        planes=start.evidence.layout.planes,
         weights=network.weights(),
         settings=settings,
         estimated_relmse=result.estimated_relmse,
         source_sha256=source_sha256(buffers),
-        layout=evidence.layout,
-        standardisation=standardisation,
+        layout=start.evidence.layout,
+        standardisation=start.standardisation,
     )
     return replace(result, model=model)
 

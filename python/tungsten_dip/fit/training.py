@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Protocol
@@ -12,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from tungsten_dip.fit.evidence import (
+    LARGEST_INPUT,
     Array,
     Evidence,
     Indices,
@@ -21,8 +21,10 @@ from tungsten_dip.fit.evidence import (
     held_out_error,
     loss_weights,
     network_inputs,
+    standardisation_of,
+    with_best_reference,
 )
-from tungsten_dip.fit.model import Weights
+from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.settings import FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
@@ -42,6 +44,9 @@ _PROBE_PIXELS = 1 << 15
 
 _PROBE_SHARE = 8
 """One pixel in this many at most is set aside."""
+
+_STRANGE = 0.5
+"""A network knows nothing of an image in which this part of a plane is as far out as inputs go."""
 
 _WARM_RATE = 0.3
 """A network that starts near its goal takes steps this many times as long."""
@@ -82,13 +87,39 @@ class Examples:
     weight: Array
 
 
-def examples_from_evidence(
-    evidence: Evidence, standardised: Callable[[Array], Standardisation]
-) -> tuple[Examples, Standardisation]:
-    """Return the examples, with inputs standardised by what ``standardised`` gives for them, and that."""
+@dataclass(frozen=True)
+class Start:
+    """What a training starts from; ``warm`` where that is a network which knows another image."""
+
+    evidence: Evidence
+    examples: Examples
+    standardisation: Standardisation
+    weights: Weights
+    warm: bool
+    notes: tuple[str, ...] = ()
+
+
+def start_of_training(evidence: Evidence, seed: int, model: Model | None = None) -> Start:
+    """Return the examples, and the weights of ``model`` or, where that knows no such images, new ones."""
     inputs = network_inputs(evidence)
-    standardisation = standardised(inputs)
+    notes: tuple[str, ...] = ()
+    if model is not None and model.standardisation is not None:
+        model.standardisation.apply(inputs)
+        far_out = [float((np.abs(plane) >= LARGEST_INPUT).mean()) for plane in np.moveaxis(inputs, 2, 0)]
+        if max(far_out) <= _STRANGE:
+            return Start(
+                evidence, _examples(evidence, inputs), model.standardisation, model.weights, warm=True
+            )
+        notes = ("the model knows no such images: a network is fitted anew",)
+        evidence = with_best_reference(evidence)
+        inputs = network_inputs(evidence)
+    standardisation = standardisation_of(inputs)
     standardisation.apply(inputs)
+    weights = first_weights(evidence.layout, seed)
+    return Start(evidence, _examples(evidence, inputs), standardisation, weights, warm=False, notes=notes)
+
+
+def _examples(evidence: Evidence, inputs: Array) -> Examples:
     pixels = inputs.shape[1]
     choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
     for index, pilot in enumerate(evidence.pilots):
@@ -96,7 +127,7 @@ def examples_from_evidence(
             choices[half, :, index] = pilot[half].reshape(pixels, 3)
     wanted = np.stack([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.stack([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
-    return Examples(inputs, choices, wanted, weight), standardisation
+    return Examples(inputs, choices, wanted, weight)
 
 
 def first_weights(layout: Layout, seed: int) -> Weights:
@@ -126,32 +157,30 @@ class Training:
 
 def train(
     network: Network,
-    examples: Examples,
-    evidence: Evidence,
+    start: Start,
     settings: FitSettings,
     steps: int,
     started: float,
     progress: Progress,
-    warm: bool,
 ) -> Training:
     """Train for ``steps`` steps, or fewer: within the time budget, to the target error, until Ctrl-C.
 
-    With ``warm``, the network knows another image already, and is done once the error of pixels that are not
-    trained on, as the halves tell it, falls no further.
+    After a warm start, the network is done once the error of pixels that are not trained on, as the halves
+    tell it, falls no further.
     """
     rng = np.random.default_rng(settings.seed)
-    pixels = examples.inputs.shape[1]
+    warm, pixels = start.warm, start.examples.inputs.shape[1]
     order = rng.permutation(pixels)
     held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
     probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
-    done = Training()
+    done = Training(notes=list(start.notes))
 
     def estimate(step: int) -> tuple[float, float]:
         """Return the error, and what the other half says of it."""
         fused_a, fused_b = (network.fuse(half, probe) for half in (0, 1))
-        error = float(estimate_error(evidence, fused_a, fused_b, probe).mean(dtype=np.float64))
+        error = float(estimate_error(start.evidence, fused_a, fused_b, probe).mean(dtype=np.float64))
         done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
-        return error, held_out_error(evidence, fused_a, fused_b, probe)
+        return error, held_out_error(start.evidence, fused_a, fused_b, probe)
 
     every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
     best, best_weights, since_best = (estimate(0)[1], network.weights(), 0) if warm else (math.inf, {}, 0)

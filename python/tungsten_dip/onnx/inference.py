@@ -26,7 +26,7 @@ from tungsten_dip.fit.evidence import (
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes, source_sha256
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.fit.training import Training, examples_from_evidence, train
+from tungsten_dip.fit.training import Training, start_of_training, train
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.onnx.sessions import session_from_proto
 from tungsten_dip.onnx.training_graph import OnnxNetwork
@@ -94,7 +94,7 @@ def _infer_fusion(
         return evidence
     training = Training()
     if refit_steps:
-        model, training = _refitted(model, evidence, settings, refit_steps, started, progress)
+        model, evidence, training = _refitted(model, evidence, settings, refit_steps, started, progress)
     fused = _fused(model, evidence, settings.threads or 0)
     result = result_from_fused(
         evidence, fused, settings, started, training.steps_done, training.history, training.notes
@@ -117,13 +117,19 @@ def _refitted(
     steps: int,
     started: float,
     progress: Progress,
-) -> tuple[Model, Training]:
-    assert model.standardisation is not None
-    standardisation = model.standardisation
-    examples, _ = examples_from_evidence(evidence, lambda _: standardisation)
-    network = OnnxNetwork(model.weights, examples, settings.threads or 0)
-    training = train(network, examples, evidence, settings, steps, started, progress, warm=True)
-    return replace(model, weights=network.weights()), training
+) -> tuple[Model, Evidence, Training]:
+    start = start_of_training(evidence, settings.seed, model)
+    network = OnnxNetwork(start.weights, start.examples, settings.threads or 0)
+    training = train(network, start, settings, steps, started, progress)
+    layout = start.evidence.layout
+    refitted = replace(
+        model,
+        planes=layout.planes,
+        weights=network.weights(),
+        layout=layout,
+        standardisation=start.standardisation,
+    )
+    return refitted, start.evidence, training
 
 
 def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
