@@ -24,6 +24,11 @@ constexpr float reach = 2.5F;
 
 constexpr float least_trace = 1e-12F;
 
+// Neighbours whose weight is below exp(-this), against 1 of the pixel itself, do not change a float's sum.
+constexpr float negligible = 25.0F;
+// Neighbouring columns for which an offset is left out together.
+constexpr int block_width = 32;
+
 // Penalty of the squared relative difference between the structure tensors of two pixels.
 constexpr float other_edge_penalty = 1.5F;
 
@@ -115,55 +120,77 @@ struct TensorRow {
         : xx(tensor.row(0, y) + dx), yy(tensor.row(1, y) + dx), xy(tensor.row(2, y) + dx) {}
 };
 
-// What one row's Gaussians are made of: the unit vectors across the edges, 1 / (2 sigma^2) along them, and
-// the penalty of differences between tensors.
+// What the Gaussians of some pixels in a row are made of: the unit vectors across the edges, 1 / (2 sigma^2)
+// along them, and the penalty of differences between tensors.
 struct Gaussians {
-    std::vector<float> normal_x;
-    std::vector<float> normal_y;
-    std::vector<float> along;
-    std::vector<float> penalty;
+    int count;
+    std::array<float, block_width> normal_x{};
+    std::array<float, block_width> normal_y{};
+    std::array<float, block_width> along{};
+    std::array<float, block_width> penalty{};
 
-    explicit Gaussians(std::size_t count) : normal_x(count), normal_y(count), along(count), penalty(count) {}
+    // Where there is no single direction, as at corners, a Gaussian shrinks to the width that it has across.
+    Gaussians(const TensorRow& tensor, int pixels, float along_sigma, float across_sigma) : count(pixels) {
+        for (int x = 0; x < count; ++x) {
+            const float xx = tensor.xx[x];
+            const float yy = tensor.yy[x];
+            const float xy = tensor.xy[x];
+            const float angle = 0.5F * std::atan2(2 * xy, xx - yy);
+            const float trace = std::max(xx + yy, least_trace);
+            const float coherence = std::sqrt((xx - yy) * (xx - yy) + 4 * xy * xy) / trace;
+            const float sigma = std::max(along_sigma * coherence * coherence, across_sigma);
+            const auto i = static_cast<std::size_t>(x);
+            normal_x[i] = std::cos(angle);
+            normal_y[i] = std::sin(angle);
+            along[i] = 0.5F / (sigma * sigma);
+            penalty[i] = other_edge_penalty / (trace * trace);
+        }
+    }
 };
 
-// Where there is no single direction, as at corners, the Gaussian shrinks to the width that it has across.
-void find_gaussians(const PaddedPlanes& tensor, int y, float along, float across, Gaussians& out) {
-    for (int x = 0; x < tensor.width(); ++x) {
-        const float xx = tensor.row(0, y)[x];
-        const float yy = tensor.row(1, y)[x];
-        const float xy = tensor.row(2, y)[x];
-        const float angle = 0.5F * std::atan2(2 * xy, xx - yy);
-        const float trace = std::max(xx + yy, least_trace);
-        const float coherence = std::sqrt((xx - yy) * (xx - yy) + 4 * xy * xy) / trace;
-        const float sigma = std::max(along * coherence * coherence, across);
-        const auto i = static_cast<std::size_t>(x);
-        out.normal_x[i] = std::cos(angle);
-        out.normal_y[i] = std::sin(angle);
-        out.along[i] = 0.5F / (sigma * sigma);
-        out.penalty[i] = other_edge_penalty / (trace * trace);
+// Minus the logarithms of the weights at an offset, but for the tensors. Returns how many are not negligible.
+TUNGSTEN_DIP_FASTEST int measure_offset(const Gaussians& gaussians, float dx, float dy, float across,
+                                        float* distances) {
+    const float across_scale = 0.5F / (across * across);
+    const float squared = dx * dx + dy * dy;
+    int near = 0;
+    for (int i = 0; i < gaussians.count; ++i) {
+        const auto x = static_cast<std::size_t>(i);
+        const float v = gaussians.normal_x[x] * dx + gaussians.normal_y[x] * dy;
+        const float distance = std::max((squared - v * v) * gaussians.along[x], 0.0F) + v * v * across_scale;
+        near += distance < negligible ? 1 : 0;
+        distances[x] = distance;
     }
+    return near;
 }
 
-// The line that an edge follows goes on where the edge itself ends: the difference of the tensors tells.
+// weights = exp(-distance). The line that an edge follows goes on where the edge itself ends: the difference
+// of the tensors tells.
 TUNGSTEN_DIP_FASTEST void weigh_offset(const Gaussians& gaussians, const TensorRow& tensor,
-                                       const TensorRow& other, float dx, float dy, float across,
-                                       float* weights) {
-    const float across_scale = 0.5F / (across * across);
-    const float distance = dx * dx + dy * dy;
-    const std::size_t count = gaussians.along.size();
-    for (std::size_t x = 0; x < count; ++x) {
-        const float v = gaussians.normal_x[x] * dx + gaussians.normal_y[x] * dy;
-        const float xx = tensor.xx[x] - other.xx[x];
-        const float yy = tensor.yy[x] - other.yy[x];
-        const float xy = tensor.xy[x] - other.xy[x];
-        weights[x] =
-            exp_minus(std::max((distance - v * v) * gaussians.along[x], 0.0F) + v * v * across_scale +
-                      (xx * xx + yy * yy + 2 * xy * xy) * gaussians.penalty[x]);
+                                       const TensorRow& other, float* weights) {
+    for (int i = 0; i < gaussians.count; ++i) {
+        const float xx = tensor.xx[i] - other.xx[i];
+        const float yy = tensor.yy[i] - other.yy[i];
+        const float xy = tensor.xy[i] - other.xy[i];
+        const float difference = xx * xx + yy * yy + 2 * xy * xy;
+        weights[i] = exp_minus(weights[i] + difference * gaussians.penalty[static_cast<std::size_t>(i)]);
     }
 }
 
 TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, const float* values, int count, float* sums) {
     for (int x = 0; x < count; ++x) sums[x] += weights[x] * values[x];
+}
+
+// Whether no pixel up to `radius` around a block holds anything, as is so of emitted light in most places.
+bool empty_around(const PaddedPlanes& planes, int y, int first, int count, int radius) {
+    for (int c = 0; c < planes.channels(); ++c) {
+        for (int row = y - radius; row <= y + radius; ++row) {
+            const float* values = planes.row(c, row) + first;
+            if (!std::all_of(values - radius, values + count + radius, [](float v) { return v == 0; }))
+                return false;
+        }
+    }
+    return true;
 }
 
 }  // namespace
@@ -175,31 +202,39 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
     const PaddedPlanes tensor = structure_tensor(features, radius, threads);
     const PaddedPlanes planes(image, radius, threads);
-    const int width = image.width;
-    parallel_for(image.height, threads, [&](int y) {
-        const auto columns = static_cast<std::size_t>(width);
-        Gaussians gaussians(columns);
-        std::vector<float> weights(columns);
+    const auto smooth_block = [&](int y, int first, int count) {
+        const TensorRow here(tensor, y, first);
+        const Gaussians gaussians(here, count, along, across);
+        std::array<float, block_width> weights{};
         // Of every channel, and of the weights.
-        std::vector<std::vector<float>> sums(static_cast<std::size_t>(image.channels) + 1,
-                                             std::vector<float>(columns));
-        const std::vector<float> ones(columns, 1.0F);
-        find_gaussians(tensor, y, along, across, gaussians);
+        std::vector<std::array<float, block_width>> sums(static_cast<std::size_t>(image.channels) + 1);
         for (int dy = -radius; dy <= radius; ++dy) {
             for (int dx = -radius; dx <= radius; ++dx) {
-                weigh_offset(gaussians, TensorRow(tensor, y, 0), TensorRow(tensor, y + dy, dx),
-                             static_cast<float>(dx), static_cast<float>(dy), across, weights.data());
+                const int near = measure_offset(gaussians, static_cast<float>(dx), static_cast<float>(dy),
+                                                across, weights.data());
+                if (near == 0) continue;
+                weigh_offset(gaussians, here, TensorRow(tensor, y + dy, first + dx), weights.data());
                 for (int c = 0; c < image.channels; ++c) {
-                    add_weighted(weights.data(), planes.row(c, y + dy) + dx, width,
+                    add_weighted(weights.data(), planes.row(c, y + dy) + first + dx, count,
                                  sums[static_cast<std::size_t>(c)].data());
                 }
-                add_weighted(weights.data(), ones.data(), width, sums.back().data());
+                for (std::size_t x = 0; x < block_width; ++x) sums.back()[x] += weights[x];
             }
         }
-        for (int x = 0; x < width; ++x) {
+        for (int x = 0; x < count; ++x) {
             for (int c = 0; c < image.channels; ++c) {
                 const auto i = static_cast<std::size_t>(x);
-                out.at(y, x, c) = sums[static_cast<std::size_t>(c)][i] / sums.back()[i];
+                out.at(y, first + x, c) = sums[static_cast<std::size_t>(c)][i] / sums.back()[i];
+            }
+        }
+    };
+    parallel_for(image.height, threads, [&](int y) {
+        for (int first = 0; first < image.width; first += block_width) {
+            const int count = std::min(block_width, image.width - first);
+            if (empty_around(planes, y, first, count, radius)) {
+                std::fill_n(&out.at(y, first, 0), std::ptrdiff_t{count} * image.channels, 0.0F);
+            } else {
+                smooth_block(y, first, count);
             }
         }
     });
