@@ -22,6 +22,38 @@ class SyntheticRender:
     reference: FloatImage
 
 
+SCENE = {
+    "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
+    "primitives": [
+        {"type": "quad", "bsdf": "grey", "transform": {"scale": 4}},
+        {"type": "infinite_sphere", "emission": [0.5, 0.7, 1.0]},
+    ],
+    "camera": {
+        "type": "pinhole",
+        "tonemap": "filmic",
+        "resolution": [17, 9],
+        "fov": 45,
+        "transform": {"position": [0, 2, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]},
+    },
+    "integrator": {"type": "path_tracer", "max_bounces": 2},
+    "renderer": {
+        "output_file": "picture.png",
+        "hdr_output_file": "picture.exr",
+        "spp": 4,
+        "output_buffers": [
+            {
+                "type": "normal",
+                "hdr_output_file": "n.exr",
+                "ldr_output_file": "n.png",
+                "two_buffer_variance": True,
+                "sample_variance": True,
+            },
+            {"type": "depth", "hdr_output_file": "z.pfm"},
+        ],
+    },
+}
+"""A small scene of Tungsten's, for every test that renders by the commands."""
+
 MakeRender = Callable[..., SyntheticRender]
 
 

@@ -1,6 +1,7 @@
 import json
 import logging
 import os
+import shlex
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import OpenImageIO
 import pytest
 
 import tungsten_dip
+from conftest import SCENE
 from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
 from tungsten_dip.cli import tungsten
 from tungsten_dip.cli import tungsten_dip as command
@@ -16,37 +18,6 @@ from tungsten_dip.cli.console import duration, minutes
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import silent
 from tungsten_dip.sequence.following import Followed
-
-SCENE = {
-    "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
-    "primitives": [
-        {"type": "quad", "bsdf": "grey", "transform": {"scale": 4}},
-        {"type": "infinite_sphere", "emission": [0.5, 0.7, 1.0]},
-    ],
-    "camera": {
-        "type": "pinhole",
-        "tonemap": "filmic",
-        "resolution": [17, 9],
-        "fov": 45,
-        "transform": {"position": [0, 2, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]},
-    },
-    "integrator": {"type": "path_tracer", "max_bounces": 2},
-    "renderer": {
-        "output_file": "picture.png",
-        "hdr_output_file": "picture.exr",
-        "spp": 4,
-        "output_buffers": [
-            {
-                "type": "normal",
-                "hdr_output_file": "n.exr",
-                "ldr_output_file": "n.png",
-                "two_buffer_variance": True,
-                "sample_variance": True,
-            },
-            {"type": "depth", "hdr_output_file": "z.pfm"},
-        ],
-    },
-}
 
 MAIN = "import sys; from tungsten_dip.cli.{} import main; sys.exit(main())"
 """What the installed commands do."""
@@ -600,3 +571,22 @@ def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
     assert "pip install 'tungsten-dip[fit]'" in captured.err
     assert "Traceback" not in captured.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])
+def test_work_is_done_without_anybody_to_talk_to(redirection, tmp_path, folder):
+    picture = tmp_path / "picture.exr"
+    options = ["denoise", str(folder), "-o", str(picture), "--preset", "draft", "--iterations", "2"]
+    program = shlex.join([sys.executable, "-c", MAIN.format("tungsten_dip"), *options])
+    done = subprocess.run(["bash", "-c", f"{program} {redirection}"], capture_output=True, check=False)
+    assert done.returncode == 0
+    assert np.isfinite(read_image(picture)).all()
+
+
+def test_a_name_that_is_no_text_is_refused_in_a_line(tmp_path, render, capfd):
+    path = tmp_path / os.fsdecode(b"bad\xff.exr")
+    write_image(path, render.reference)
+    assert command.main(["inspect", str(path)]) == 2
+    _, errors = capfd.readouterr()
+    assert "expected a name in UTF-8; rename it" in errors
+    assert len(errors.splitlines()) == 1

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import OpenImageIO
 
+from conftest import SCENE
 from moving_camera import write_frames
 from row import Row
 from tungsten_dip.buffers.image_file import read_parts
@@ -23,27 +24,6 @@ from tungsten_dip.onnx import load_model
 KILLS = 50
 KILLS_BETWEEN_WHOLE_RUNS = 6
 KILLS_BETWEEN_EMPTYING = 2
-
-_SCENE = {
-    "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
-    "primitives": [
-        {"type": "quad", "bsdf": "grey", "transform": {"scale": 4}},
-        {"type": "infinite_sphere", "emission": [0.5, 0.7, 1.0]},
-    ],
-    "camera": {
-        "type": "pinhole",
-        "resolution": [33, 21],
-        "fov": 45,
-        "transform": {"position": [0, 2, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]},
-    },
-    "integrator": {"type": "path_tracer", "max_bounces": 2},
-    "renderer": {
-        "output_file": "picture.png",
-        "hdr_output_file": "picture.exr",
-        "spp": 4,
-        "output_buffers": [{"type": "normal", "hdr_output_file": "n.exr", "two_buffer_variance": True}],
-    },
-}
 
 
 @dataclass(frozen=True)
@@ -65,8 +45,9 @@ COMMANDS = (
             *("--dip-save-model", "out/model.onnx", "--output-directory", "out", "scene.json"),
         ),
         (
-            *("picture.png", "picture.exr", "n.exr", "nA.exr", "nB.exr", "picture_denoised.exr"),
-            *("picture_denoised.png", "picture_side_by_side.png", "report.html", "model.onnx"),
+            *("picture.png", "picture.exr", "n.exr", "nA.exr", "nB.exr", "n.png", "z.pfm"),
+            *("picture_denoised.exr", "picture_denoised.png", "picture_side_by_side.png"),
+            *("report.html", "model.onnx"),
         ),
     ),
     Command(
@@ -103,7 +84,7 @@ def write_inputs(folder: Path) -> None:
     """Write what the commands read."""
     write_frames(folder, 4)
     (folder / "out").mkdir()
-    (folder / "scene.json").write_text(json.dumps(_SCENE))
+    (folder / "scene.json").write_text(json.dumps(SCENE))
 
 
 def start(command: Command, folder: Path, before: str = "", **options: object) -> subprocess.Popen[str]:

@@ -109,11 +109,12 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")
     spec["pnm:pfmflip"] = 1
     with replacing(path) as temporary:
-        output = oiio.ImageOutput.create(str(temporary))
+        name = _checked_name(temporary)
+        output = oiio.ImageOutput.create(name)
         pixels = np.ascontiguousarray(image, dtype=np.float32)
         if output is None:
             raise OSError(_one_line(oiio.geterror()))
-        written = output.open(str(temporary), spec) and output.write_image(pixels)
+        written = output.open(name, spec) and output.write_image(pixels)
         closed = output.close()
         # A full disk may show in the message alone: the PNG encoder then still claims success.
         message = output.geterror()
@@ -121,10 +122,19 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
             raise OSError(_one_line(message))
 
 
+def _checked_name(path: Path) -> str:
+    """Return the path as OpenImageIO takes it. Raises InputError if the name is no UTF-8."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: expected a name in UTF-8; rename it") from None
+    return str(path)
+
+
 def _decoded(path: Path) -> tuple[Part, ...]:
     config = oiio.ImageSpec()
     config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
-    image = oiio.ImageInput.open(str(path), config)
+    image = oiio.ImageInput.open(_checked_name(path), config)
     if image is None:
         raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
     try:

@@ -11,7 +11,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 from tqdm import tqdm
@@ -62,6 +62,7 @@ class Parser(argparse.ArgumentParser):
 def run(command: str, body: Callable[[], None]) -> int:
     """Run a command's body and return its exit status; whatever goes wrong becomes one line on stderr."""
     debug = bool(os.environ.get(DEBUG_VARIABLE))
+    _replace_closed_streams()
     try:
         with _log_on_stderr(command):
             body()
@@ -145,10 +146,10 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
             return
         last = now
         left = f", {tqdm.format_interval((now - start) * (1 / fraction - 1))} left" if fraction > 0 else ""
-        print(f"{what}: {fraction:.0%}{left}{', ' + message if message else ''}", file=sys.stderr, flush=True)
+        _tell(f"{what}: {fraction:.0%}{left}{', ' + message if message else ''}")
 
     yield tell
-    print(f"{what}: done in {tqdm.format_interval(time.monotonic() - start)}", file=sys.stderr, flush=True)
+    _tell(f"{what}: done in {tqdm.format_interval(time.monotonic() - start)}")
 
 
 def add_threads(parser: argparse._ActionsContainer) -> None:
@@ -203,7 +204,8 @@ class _StderrHandler(logging.Handler):
     """Writes log lines above a progress bar, if one is being drawn."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        tqdm.write(self.format(record), file=sys.stderr)
+        with suppress(OSError):
+            tqdm.write(self.format(record), file=sys.stderr)
 
 
 @contextmanager
@@ -235,8 +237,21 @@ def _message(error: Exception) -> str:
 
 
 def _fail(command: str, message: str, status: int) -> int:
-    print(f"{command}: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    _tell(f"{command}: {' '.join(message.split())}")
     return status
+
+
+def _tell(line: str) -> None:
+    """Print a line on stderr; a full disk or a reader that is gone there must not end the work."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def _replace_closed_streams() -> None:
+    """Open what the shell has closed (``>&-``), lest a picture be opened in its place and written to."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 (for the process's life)
 
 
 def _finite(value: Any) -> Any:
