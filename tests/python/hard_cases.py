@@ -388,6 +388,10 @@ _NO_EDGES = {
 }
 _BEYOND = {"exposure": "exposures are undone up to 2^100"}
 _EMITTED = {"exposure": "albedo above 1 is light that a surface emits, in the renderer's units"}
+_BOUNDED = {
+    "mean": "a wild albedo is bounded by the noisy colour, which is then all that the pilots know; choosing "
+    "among them darkens small images (this one by 1.1%, 144x96 pixels by 0.4%)"
+}
 
 
 def _cases() -> Iterator[HardCase]:
@@ -455,7 +459,9 @@ def _cases() -> Iterator[HardCase]:
     yield HardCase(group, "depth 0", _feature("depth", lambda image, _: 0 * image))
     yield HardCase(group, "albedo 0", _feature("albedo", lambda image, _: 0 * image), _NO_EDGES)
     yield HardCase(group, "albedo 0 in half the image", _feature("albedo", _black_on_the_left), _NO_EDGES)
-    yield HardCase(group, "albedo above 1", _feature("albedo", lambda image, _: 20 * image), _EMITTED)
+    yield HardCase(
+        group, "albedo above 1", _feature("albedo", lambda image, _: 20 * image), _EMITTED | _BOUNDED
+    )
     yield HardCase(group, "albedo 1e30 in one pixel", _feature("albedo", _one_wild), _EMITTED)
 
     for height, width in ((1, 1), (1, 64), (64, 1), (5, 7), (65, 33), (1000, 31), (16, 8192), (4096, 1)):

@@ -17,7 +17,7 @@ def write_measured(path: Path, measured: list[Measured], others: list[Row]) -> N
 
 
 def _tables(measured: list[Measured], others: list[Row]) -> str:
-    parts = []
+    parts = [] if all(m.held for m in measured) else ["In bold: a promise that is not kept yet.\n"]
     for group in dict.fromkeys(m.case.group for m in measured):
         of_group = [m for m in measured if m.case.group == group]
         lines = [f"### {group}", "", "| case | error | mean | harm | ways |", "|---|---|---|---|---|"]
