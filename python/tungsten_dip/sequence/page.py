@@ -18,7 +18,7 @@ from tungsten_dip.sequence.work import Record
 _MOST_PICTURES = 24
 _PICTURE_WIDTH = 320
 _WIDTH, _HEIGHT = 720, 180
-_LEFT, _RIGHT, _TOP, _BOTTOM = 90, 24, 12, 40
+_LEFT, _RIGHT, _TOP, _BOTTOM = 120, 24, 20, 40
 """Size of a plot and its margins in the units of the SVG."""
 
 _FLICKER_NOTE = (
@@ -119,5 +119,5 @@ def _plot(records: Sequence[Record], what: str, value_of: Callable[[Record], flo
         told = escape(f"frame {number}: {value:.3g}")
         lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3"><title>{told}</title></circle>')
     label = f"{what} of every frame"
-    svg = f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">'
+    svg = f'<svg class="curve-plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">'
     return f"{svg}{''.join(lines)}</svg>"
