@@ -84,7 +84,9 @@ def write_inputs(folder: Path) -> None:
     """Write what the commands read."""
     write_frames(folder, 4)
     (folder / "out").mkdir()
-    (folder / "scene.json").write_text(json.dumps(SCENE))
+    # Larger, lest its pictures fit on the fullest of disks.
+    scene = {**SCENE, "camera": {**SCENE["camera"], "resolution": [33, 21]}}
+    (folder / "scene.json").write_text(json.dumps(scene))
 
 
 def start(command: Command, folder: Path, before: str = "", **options: object) -> subprocess.Popen[str]:
