@@ -18,8 +18,8 @@ _Pair = tuple[FloatImage, FloatImage]
 _OCTAVES = np.arange(0, 4.5, 0.5)
 """Pixels so many factors of two darker (or brighter) than the result, or more, are judged together."""
 
-_FEW = 4
-"""Fewer pixels tell nothing of others."""
+_FEW = 12
+"""Fewer pixels tell nothing of others: among heavy-tailed noise their standard error is too small."""
 
 _SURELY = 2.0
 """Standard errors less than the other half tells that a difference is believed to be true."""
