@@ -402,6 +402,26 @@ def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
     assert np.abs(image[far].mean() / color.mean[far].mean() - 1) < 0.05
 
 
+def test_adam_is_that_of_torch() -> None:
+    import torch
+    from tungsten_dip.fit.fusion import ADAM_BETAS, ADAM_EPSILON, _Adam
+
+    generator = torch.Generator().manual_seed(0)
+    ours = [torch.randn(3, 5, generator=generator), torch.randn(7, generator=generator)]
+    theirs = [value.clone().requires_grad_() for value in ours]
+    adam = _Adam(ours)
+    optimizer = torch.optim.Adam(theirs, betas=ADAM_BETAS, eps=ADAM_EPSILON)
+    for step in range(1, 8):
+        gradients = [torch.randn(value.shape, generator=generator) for value in ours]
+        adam.step(gradients, 0.1 / step)
+        optimizer.param_groups[0]["lr"] = 0.1 / step
+        for value, gradient in zip(theirs, gradients, strict=True):
+            value.grad = gradient
+        optimizer.step()
+    for value, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(value, expected.detach())
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.device import compute_device
@@ -106,56 +107,90 @@ class _TorchNetwork:
 
     def __init__(self, weights: Weights, examples: Examples, device: torch.device) -> None:
         self._device = device
+        self._pixels = examples.inputs.shape[1]
+        # Both halves one after the other: one index for both is gathered far sooner than a pair.
         self._inputs, self._choices, self._wanted, self._weight = (
-            torch.from_numpy(array)
+            torch.from_numpy(array).flatten(0, 1)
             for array in (examples.inputs, examples.choices, examples.wanted, examples.weight)
         )
-        layers: list[nn.Module] = []
-        for layer in (1, 2, 3):
-            outputs, inputs = weights[f"layer{layer}.weight"].shape[:2]
-            layers += [nn.Linear(inputs, outputs), nn.LeakyReLU(LEAKY_SLOPE)]
-        self._network = nn.Sequential(*layers[:-1]).to(device)
-        self._parameters = dict(zip(weights, self._network.parameters(), strict=True))
-        self.load(weights)
-        self._optimizer = torch.optim.Adam(
-            self._network.parameters(), lr=0.0, betas=ADAM_BETAS, eps=ADAM_EPSILON
-        )
+        self._names = tuple(weights)
+        self._parameters = [
+            torch.from_numpy(value.reshape(value.shape[:2])).to(device, copy=True).requires_grad_()
+            for value in weights.values()
+        ]
+        self._adam = _Adam(self._parameters)
 
     def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
         """Do one step of Adam."""
-        self._optimizer.param_groups[0]["lr"] = learning_rate
-        at = torch.from_numpy(half), torch.from_numpy(pixel)
-        squared = (self._fuse(*at) - self._wanted[at].to(self._device)) ** 2
-        loss = (squared * self._weight[at].to(self._device)).mean()
-        self._optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self._optimizer.step()
+        self._adam.step(self.gradients(half, pixel), learning_rate)
+
+    def gradients(self, half: Indices, pixel: Indices) -> Sequence[Tensor]:
+        """Return the gradients of the mean weighted squared error in the parameters."""
+        at = torch.from_numpy(half * self._pixels + pixel)
+        squared = (self._fuse(at) - self._gathered(self._wanted, at)) ** 2
+        loss = (squared * self._gathered(self._weight, at)).mean()
+        return torch.autograd.grad(loss, self._parameters)
 
     @torch.no_grad()
     def fuse(self, half: int, pixel: Indices | slice) -> Array:
         """Return the weighted mean of the pilots, shape (pixels, 3)."""
-        at = pixel if isinstance(pixel, slice) else torch.from_numpy(pixel)
-        fused: FloatImage = self._fuse(half, at).cpu().numpy()
+        within = np.arange(self._pixels)[pixel]
+        fused: FloatImage = self._fuse(torch.from_numpy(half * self._pixels + within)).cpu().numpy()
         return fused
 
     def fuse_all(self, half: int) -> Array:
         """Return `fuse` of every pixel, not all at once."""
-        pixels = range(0, self._inputs.shape[1], _CHUNK_PIXELS)
-        return np.concatenate([self.fuse(half, slice(first, first + _CHUNK_PIXELS)) for first in pixels])
+        firsts = range(0, self._pixels, _CHUNK_PIXELS)
+        return np.concatenate([self.fuse(half, slice(first, first + _CHUNK_PIXELS)) for first in firsts])
 
-    @torch.no_grad()
     def weights(self) -> Weights:
         """Return a copy of the weights, shaped as those of 1x1 convolutions."""
-        copies = {name: value.cpu().numpy().copy() for name, value in self._parameters.items()}
-        return {name: w[:, :, None, None] if w.ndim == 2 else w for name, w in copies.items()}
+        copies = (value.detach().cpu().numpy().copy() for value in self._parameters)
+        return {
+            name: value[:, :, None, None] if value.ndim == 2 else value
+            for name, value in zip(self._names, copies, strict=True)
+        }
 
     @torch.no_grad()
     def load(self, weights: Weights) -> None:
         """Replace the weights."""
-        for name, value in self._parameters.items():
+        for name, value in zip(self._names, self._parameters, strict=True):
             value.copy_(torch.from_numpy(weights[name].reshape(value.shape)))
 
-    def _fuse(self, half: Tensor | int, pixel: Tensor | slice) -> Tensor:
-        logits = self._network(self._inputs[half, pixel].to(self._device))
-        fused: Tensor = (logits.softmax(1)[..., None] * self._choices[half, pixel].to(self._device)).sum(1)
-        return fused
+    def _fuse(self, at: Tensor) -> Tensor:
+        # Pixels last: a softmax over a short last axis crawls.
+        x = self._gathered(self._inputs, at).t()
+        layers = list(zip(self._parameters[::2], self._parameters[1::2], strict=True))
+        for index, (weight, bias) in enumerate(layers):
+            if index:
+                x = F.leaky_relu(x, LEAKY_SLOPE)
+            x = torch.addmm(bias[:, None], weight, x)
+        choices = self._gathered(self._choices, at).permute(1, 2, 0)
+        return (x.softmax(0)[:, None] * choices).sum(0).t()
+
+    def _gathered(self, values: Tensor, at: Tensor) -> Tensor:
+        return values.index_select(0, at).to(self._device)
+
+
+class _Adam:
+    """Kingma and Ba 2015, "Adam". That of torch.optim takes longer to import than a draft takes to fit."""
+
+    def __init__(self, parameters: list[Tensor]) -> None:
+        self._parameters = parameters
+        self._means = [torch.zeros_like(value) for value in parameters]
+        self._squares = [torch.zeros_like(value) for value in parameters]
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, gradients: Sequence[Tensor], learning_rate: float) -> None:
+        """Move the parameters against their gradients."""
+        self._steps += 1
+        keep, keep_square = ADAM_BETAS
+        size = learning_rate / (1 - keep**self._steps)
+        unbias = 1 / (1 - keep_square**self._steps)
+        for value, gradient, mean, square in zip(
+            self._parameters, gradients, self._means, self._squares, strict=True
+        ):
+            mean.lerp_(gradient, 1 - keep)
+            square.mul_(keep_square).addcmul_(gradient, gradient, value=1 - keep_square)
+            value.addcdiv_(mean, (square * unbias).sqrt_().add_(ADAM_EPSILON), value=-size)
