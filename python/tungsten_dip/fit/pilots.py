@@ -94,7 +94,12 @@ FINAL_PILOTS = (
     Pilot(24, k=1.0, step=3, with_position=True),
 )
 
-FOLLOWING_PILOTS = (Pilot(2), Pilot(5, k=2.0))
+FOLLOWING_PILOTS = (
+    Pilot(1),
+    EDGES,
+    Pilot(6, k=2.0, step=2),
+    Pilot(12, step=2, with_position=True),
+)
 """Enough beside what the previous frame shows. The first stands where that shows nothing."""
 
 
