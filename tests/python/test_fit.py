@@ -404,6 +404,7 @@ def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
 
 def test_adam_is_that_of_torch() -> None:
     import torch
+
     from tungsten_dip.fit.fusion import ADAM_BETAS, ADAM_EPSILON, _Adam
 
     generator = torch.Generator().manual_seed(0)
