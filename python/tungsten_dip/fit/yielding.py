@@ -18,7 +18,7 @@ _Pair = tuple[FloatImage, FloatImage]
 _OCTAVES = np.arange(0, 4.5, 0.5)
 """Pixels so many factors of two darker (or brighter) than the result, or more, are judged together."""
 
-_FEW = 12
+_FEW = 6
 """Fewer pixels tell nothing of others: among heavy-tailed noise their standard error is too small."""
 
 _SURELY = 2.0
