@@ -251,7 +251,7 @@ def _replace_closed_streams() -> None:
     """Open what the shell has closed (``>&-``), lest a picture be opened in its place and written to."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 (for the process's life)
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
 
 
 def _finite(value: Any) -> Any:

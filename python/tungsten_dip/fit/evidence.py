@@ -28,12 +28,12 @@ from tungsten_dip.fit.pilots import (
     FOLLOWING_PILOTS,
     Guidance,
     Pilot,
-    first_pilots,
-    following_pilots,
+    first_guides,
+    following_guides,
     guidance_of_halves,
     pilot_images,
 )
-from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.fit.yielding import with_what_was_lost
 from tungsten_dip.progress import Progress
 
@@ -43,7 +43,6 @@ Indices = npt.NDArray[np.int64]
 Halves = tuple[FloatImage, FloatImage]
 """An image made of half A of the samples alone, and one made of half B alone; shape (height, width, 3)."""
 
-RELMSE_EPSILON = 0.01
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
 
@@ -242,7 +241,7 @@ def evidence_from_buffers(
             colors = (_scaled(color.mean, scale),)
             guidance = guidance_of_halves(buffers, colors, scale, threads)
             progress(0.2, "features")
-            guides, irradiances, noise = first_pilots(colors, variance, guidance)
+            guides, irradiances, noise = first_guides(colors, variance, guidance)
             (image,) = pilot_images(_ONLY_PILOT, colors, irradiances, guides, noise, guidance)
             image = _unscaled(image, scale)
         seconds = time.perf_counter() - started
@@ -265,10 +264,10 @@ def evidence_from_buffers(
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
     if previous is None:
-        guides, irradiances, noise = first_pilots(halves, variance, guidance)
+        guides, irradiances, noise = first_guides(halves, variance, guidance)
     else:
         moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
-        guides, irradiances, noise, first, filled = following_pilots(halves, moved, guidance)
+        guides, irradiances, noise, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812
-from torch import Tensor
+from torch import Tensor, nn
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.device import compute_device
@@ -163,7 +162,7 @@ class _TorchNetwork:
         layers = list(zip(self._parameters[::2], self._parameters[1::2], strict=True))
         for index, (weight, bias) in enumerate(layers):
             if index:
-                x = F.leaky_relu(x, LEAKY_SLOPE)
+                x = nn.functional.leaky_relu(x, LEAKY_SLOPE)
             x = torch.addmm(bias[:, None], weight, x)
         choices = self._gathered(self._choices, at).permute(1, 2, 0)
         return (x.softmax(0)[:, None] * choices).sum(0).t()

@@ -233,7 +233,7 @@ def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
     return (feature.mean,) * count
 
 
-def first_pilots(
+def first_guides(
     colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: tuple[Guidance, ...]
 ) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, ...], FloatImage]:
     """Return (guides, demodulated colours, guide variance) for the guided pilots.
@@ -256,10 +256,10 @@ def first_pilots(
     return guides, irradiances, noise
 
 
-def following_pilots(
+def following_guides(
     colors: _Pair, previous: _Pair, guidance: tuple[Guidance, ...]
 ) -> tuple[_Pair, _Pair, FloatImage, _Pair, _Pair]:
-    """Return (guides, demodulated colours, guide variance) as `first_pilots`, at a part of its cost.
+    """Return (guides, demodulated colours, guide variance) as `first_guides`, at a part of its cost.
 
     ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the
     guide, filled by the first of `FOLLOWING_PILOTS`; both come with it: (..., first pilot, filled previous).

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
 
+RELMSE_EPSILON = 0.01
+"""Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""
+
 PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 """What the preset ``paper`` alone leaves open."""
 

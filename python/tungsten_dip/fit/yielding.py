@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _Floats = npt.NDArray[np.float64]
 _Pair = tuple[FloatImage, FloatImage]
@@ -26,9 +27,6 @@ _SURELY = 2.0
 
 _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""
-
-_EPSILON = 0.01
-"""Of the relMSE that is lowered."""
 
 
 def with_what_was_lost(halves: _Pair, fused: _Pair) -> _Pair:
@@ -49,7 +47,7 @@ def with_what_was_lost(halves: _Pair, fused: _Pair) -> _Pair:
         for half, place in enumerate(places):
             image = fused[half][place].astype(np.float64)
             shown, shown_by_other = halves[half][place] - image, halves[1 - half][place] - image
-            denominator = image.mean(axis=1) ** 2 + _EPSILON
+            denominator = image.mean(axis=1) ** 2 + RELMSE_EPSILON
             own.append((shown**2).mean(axis=1) / denominator)
             told.append((shown * shown_by_other).mean(axis=1) / denominator)
         slopes = _sure_slopes(np.concatenate(apart), np.concatenate(own), np.concatenate(told))

@@ -12,11 +12,9 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _LOG = logging.getLogger(__name__)
-
-RELMSE_EPSILON = 0.01
-"""Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""
 
 DISPLAY_GAMMA = 2.2
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatImage
-from tungsten_dip.report.metrics import RELMSE_EPSILON
+from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 Halves = tuple[FloatImage, FloatImage]
 

@@ -1,0 +1,48 @@
+"""How good a denoised sequence is: mean PSNR, relMSE, FLIP and flicker, by the references of its frames.
+
+    python benchmarks/frames.py 'references/f####.exr' 'cold/f####.exr' 'followed/f####.exr' ...
+
+prints a Markdown table with a row per sequence. The first frame counts only as the one before the second.
+"""
+
+import argparse
+from itertools import pairwise
+
+import numpy as np
+
+from tungsten_dip.buffers import FloatImage, read_image
+from tungsten_dip.report.metrics import compare
+from tungsten_dip.sequence.flicker import flicker
+from tungsten_dip.sequence.frames import find_frames
+
+
+def main() -> None:
+    """Compare every sequence with the references, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("references", metavar="REFERENCES")
+    parser.add_argument("sequences", metavar="FRAMES", nargs="+")
+    options = parser.parse_args()
+    references = _images(options.references)
+    print("| | PSNR | relMSE | FLIP | flicker |")
+    print("|---|---|---|---|---|")
+    for pattern in options.sequences:
+        images = _images(pattern)
+        found = [compare(image, references[number]) for number, image in images.items()][1:]
+        flickers = [
+            flicker(images[n], images[before], references[n], references[before])
+            for before, n in pairwise(images)
+        ]
+        psnr, relmse, flip = (
+            np.mean([getattr(one, name) for one in found]) for name in ("psnr", "relmse", "flip")
+        )
+        print(f"| {pattern} | {psnr:.2f} | {relmse:.5f} | {flip:.4f} | {np.mean(flickers):.5f} |")
+
+
+def _images(pattern: str) -> dict[int, FloatImage]:
+    return {frame.number: read_image(frame.input) for frame in find_frames(pattern, pattern)}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Where a fit stops: PSNR of its last image, and how far the best image of the same run is above it.
+
+    python benchmarks/stopping.py renders/cornell-box/n4=renders/cornell-box/reference.exr ...
+
+prints a Markdown table. The image is looked at every 20 steps, before it yields to the noisy pixels.
+"""
+
+import argparse
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from tungsten_dip.bench.sets import BenchSet, read_sets
+from tungsten_dip.fit import FitSettings, denoise, fusion
+from tungsten_dip.fit.evidence import Evidence, Indices
+from tungsten_dip.fit.settings import Preset
+from tungsten_dip.fit.training import Start, start_of_training
+from tungsten_dip.model import Model
+from tungsten_dip.report.metrics import compare
+
+PRESETS: tuple[Preset, ...] = ("draft", "balanced")
+EVERY = 20
+
+
+def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
+    """Return the PSNR in dB after every `EVERY` steps of a fit."""
+    found: list[float] = []
+    starts: list[Start] = []
+
+    class Watched(fusion._TorchNetwork):
+        steps = 0
+
+        def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
+            super().step(half, pixel, learning_rate)
+            self.steps += 1
+            if self.steps % EVERY == 0:
+                evidence = starts[-1].evidence
+                image = np.float32(0.5 / evidence.scale) * (self.fuse_all(0) + self.fuse_all(1))
+                found.append(compare(image.reshape(evidence.mean.shape), bench_set.reference).psnr)
+
+    def start(evidence: Evidence, seed: int, model: Model | None = None) -> Start:
+        starts.append(start_of_training(evidence, seed, model))
+        return starts[-1]
+
+    with (
+        mock.patch.object(fusion, "_TorchNetwork", Watched),
+        mock.patch.object(fusion, "start_of_training", start),
+    ):
+        denoise(bench_set.buffers, FitSettings(preset))
+    return found
+
+
+def main() -> None:
+    """Watch every preset on every set, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sets", metavar="SET=REFERENCE", nargs="+")
+    sets = read_sets(parser.parse_args().sets)
+    print("| |", *(f"{Path(s.name)} |" for s in sets))
+    print("|---|" + "---|" * len(sets))
+    for preset in PRESETS:
+        curves = [psnrs(bench_set, preset) for bench_set in sets]
+        cells = (f"{curve[-1]:.2f} ({max(curve) - curve[-1]:.2f}) |" for curve in curves)
+        print(f"| {preset}, {EVERY * len(curves[0])} steps |", *cells, flush=True)
+
+
+if __name__ == "__main__":
+    main()
