@@ -71,7 +71,7 @@ _LEAST_NOISE = 1.0
 _LEAST_SPREAD = 1e-6
 LARGEST_INPUT = 4.0
 _ERROR_RADIUS = 4
-_BIAS = 2.0
+_BIAS = 1.5
 """What the squared bias is to the median squared difference of the pilots from the result, about."""
 
 _CONFIDENCE = 4.0
