@@ -80,17 +80,6 @@ def test_up_equals_upsampling_and_convolving_layer_by_layer():
     torch.testing.assert_close(up(coarse, None), plain)
 
 
-@pytest.mark.parametrize("channels", [3, 20])
-def test_norm_act_equals_torch_in_any_memory_order(channels):
-    layer = randomised(networks._NormAct(channels))
-    x = channels_last(2, channels, 5, 4)
-    plain = F.batch_norm(x, None, None, layer.weight, layer.bias, training=True, eps=layer.eps)
-    plain = F.leaky_relu(plain, networks.LEAKY_SLOPE)
-    torch.testing.assert_close(layer(x.clone().requires_grad_()), plain)
-    torch.testing.assert_close(layer(x.contiguous().requires_grad_()), plain)
-    torch.testing.assert_close(layer(x), plain)
-
-
 @pytest.mark.parametrize("network", [Skip(2, 1, TINY), ResNet(2, 1, blocks=1, width=3)])
 def test_gradients_are_those_of_the_values(network):
     network = network.double().to(memory_format=torch.channels_last)

@@ -133,51 +133,7 @@ class _NormAct(_Norm):
     """Batch norm, then leaky ReLU in place."""
 
     def forward(self, x: Tensor) -> Tensor:
-        # torch's batch norm crawls where few channels lie last in memory.
-        few_last = x.shape[1] < 16 and x.permute(0, 2, 3, 1).is_contiguous()
-        if few_last and x.requires_grad and x.device.type == "cpu":
-            rows = _NormActOfRows.apply(x, self.weight, self.bias, self.eps)  # type: ignore[no-untyped-call]
-            return cast(Tensor, rows)
         return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
-
-
-class _NormActOfRows(torch.autograd.Function):
-    """Norm and leaky ReLU of an image with channels last, as a matrix of its rows of pixels."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
-        """Take and return (batch, channels, height, width)."""
-        width = x.shape[3]
-        rows = x.permute(0, 2, 3, 1).flatten(2).flatten(0, 1)
-        offset = rows - _row_mean(rows, width).repeat(width)
-        inverse_std = torch.rsqrt(_row_mean(offset * offset, width) + eps)
-        y = torch.addcmul(bias.repeat(width), offset, (weight * inverse_std).repeat(width))
-        F.leaky_relu_(y, LEAKY_SLOPE)
-        ctx.save_for_backward(offset, y, weight, inverse_std)
-        return y.view(x.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
-        """Return the gradients of x, weight and bias."""
-        offset, y, weight, inverse_std = ctx.saved_tensors
-        width = grad.shape[3]
-        g = torch.ops.aten.leaky_relu_backward(
-            grad.permute(0, 2, 3, 1).reshape(y.shape), y, LEAKY_SLOPE, True
-        )
-        mean_g = _row_mean(g, width)
-        mean_g_normal = _row_mean(g * offset, width) * inverse_std
-        scale = weight * inverse_std
-        dx = torch.addcmul(
-            (-scale * mean_g).repeat(width), offset, (-scale * inverse_std * mean_g_normal).repeat(width)
-        ).addcmul_(g, scale.repeat(width))
-        pixels = grad.numel() // grad.shape[1]
-        shape = grad.permute(0, 2, 3, 1).shape
-        return dx.view(shape).permute(0, 3, 1, 2), mean_g_normal * pixels, mean_g * pixels, None
-
-
-def _row_mean(rows: Tensor, width: int) -> Tensor:
-    """Mean of every channel of (rows, width * channels); long rows first, for that is what runs fast."""
-    return rows.mean(0).view(width, -1).mean(0)
 
 
 class _Down(nn.Sequential):
