@@ -1,7 +1,7 @@
 """Frames on many processes or machines: Dask schedules them, workers read and write the files themselves.
 
-One task fits the first frames, whose networks all others share. Frames that follow one another are one task,
-so that what one shows helps the next. A worker that dies loses the frame in hand: its task is done again
+The first frame's networks are shared by all that begin later. Frames that follow one another are one task, so
+that what one shows helps the next. A worker that dies loses the frame in hand: its task is done again
 elsewhere and skips what is finished.
 """
 
@@ -28,6 +28,12 @@ _LONGEST_TASK = 24
 """Frames; a task that is done again has to look at all of them."""
 
 _CONNECT_TIMEOUT_S = 30
+
+_LOCAL_WORKERS = {
+    # By default glibc hands all memory back at once, and a fit, which takes it again, needs twice the time.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+    "distributed.worker.profile.enabled": False,
+}
 
 
 def denoise_on_cluster(
@@ -72,16 +78,22 @@ def _done(
     """Yield records as they come, the first frames' with their networks."""
     from distributed import as_completed
 
-    # A frame with a camera also fits the network for frames that follow.
-    lead = frames[: 2 if frames[0].scene is not None else 1]
-    rest = frames[len(lead) :]
-    first = client.submit(denoise_frames, lead, run, models, key=_key(lead), pure=False)
-    tasks = {first: lead}
-    shared = client.submit(itemgetter(1), first, pure=False)
     count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    # Frames that do not help one another are tasks of their own: none waits for a slow one.
-    length = min(_LONGEST_TASK, -(-len(rest) // count)) if frames[0].scene is not None else 1
-    for start in range(0, len(rest), max(length, 1)):
+    if frames[0].scene is not None:
+        # The second frame fits the network for those that follow; all others follow one another.
+        leads = [frames[:2]]
+        length = max(1, min(_LONGEST_TASK, -(-(len(frames) - 2) // count)))
+    else:
+        # No frame helps another but by its network: rather than wait for one, every worker fits one.
+        leads = [[frame] for frame in frames[:count]]
+        length = 1
+    tasks = {
+        client.submit(denoise_frames, lead, run, models, key=_key(lead), pure=False): lead for lead in leads
+    }
+    first = next(iter(tasks))
+    shared = client.submit(itemgetter(1), first, pure=False)
+    rest = frames[sum(map(len, leads)) :]
+    for start in range(0, len(rest), length):
         part = rest[start : start + length]
         tasks[client.submit(denoise_frames, part, run, shared, key=_key(part), pure=False)] = part
     for task in as_completed(tasks):
@@ -95,6 +107,7 @@ def _done(
 @contextmanager
 def _client(scheduler: str, workers: int) -> Iterator[Any]:
     try:
+        import dask
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise InputError(
@@ -103,6 +116,7 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler == "local":
         with (
+            dask.config.set(_LOCAL_WORKERS),
             LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
