@@ -14,9 +14,9 @@ import numpy as np
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.fit import FitSettings, denoise, fusion
 from tungsten_dip.fit.evidence import Evidence, Indices
+from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import Start, start_of_training
-from tungsten_dip.model import Model
 from tungsten_dip.report.metrics import compare
 
 PRESETS: tuple[Preset, ...] = ("draft", "balanced")

@@ -112,9 +112,7 @@ def _measured(index: int) -> tuple[Outcome, dict[str, tuple[str, ...]]]:
         "balanced": lambda: denoise(damaged.buffers, _few("balanced")),
         "final": lambda: denoise(damaged.buffers, _few("final")),
         "paper": lambda: denoise(damaged.buffers, PAPER),
-        "warm start": lambda: denoise(
-            damaged.buffers, replace(DRAFT, iterations=20), warm_start=_healthy(DRAFT).model
-        ),
+        "warm start": lambda: denoise(damaged.buffers, DRAFT, warm_start=_healthy(DRAFT).model),
         "onnxruntime": onnx,
     }
     drafted = Outcome(False)
