@@ -12,7 +12,7 @@ from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.pilots import Guidance, guidance_of_halves
+from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, Guidance, guidance_of_halves
 
 pytest.importorskip("torch")
 
@@ -290,6 +290,16 @@ def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:
     _check(result, render.buffers)
     assert result.iterations == 1
     assert any("time budget" in note for note in result.notes)
+
+
+def test_within_a_time_budget_the_pilots_of_draft_come_first(render: SyntheticRender) -> None:
+    result = denoise(render.buffers, _settings(preset="balanced", iterations=2, time_budget_s=1e6))
+    _check(result, render.buffers)
+    assert result.model is not None
+    assert result.model.layout is not None
+    pilots = result.model.layout.pilots
+    assert pilots[: len(DRAFT_PILOTS)] == DRAFT_PILOTS
+    assert set(pilots) == {*DRAFT_PILOTS, *BALANCED_PILOTS}
 
 
 def test_the_target_error_ends_the_training(render: SyntheticRender) -> None:

@@ -25,6 +25,7 @@ from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
+    DRAFT_PILOTS,
     FOLLOWING_PILOTS,
     Guidance,
     Pilot,
@@ -73,6 +74,10 @@ LARGEST_INPUT = 4.0
 _ERROR_RADIUS = 4
 _BIAS = 1.5
 """What the squared bias is to the median squared difference of the pilots from the result, about."""
+
+_PILOTS_SHARE = 0.45
+_DRAFT_SHARE = 0.7
+"""Of a time budget, after which no further pilot, or none of draft's, begins; the rest is the training's."""
 
 _CONFIDENCE = 4.0
 """Standard errors above what the halves tell that an estimated error is believed."""
@@ -272,7 +277,8 @@ def evidence_from_buffers(
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
-        late = time.perf_counter() - started > 0.7 * (settings.time_budget_s or math.inf)
+        share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE
+        late = time.perf_counter() - started > share * (settings.time_budget_s or math.inf)
         if layout is None and index > 0 and late:
             break
         if pilot not in computed:

@@ -67,6 +67,9 @@ def fit_fusion(
     if warm_start is not None:
         check_settings(warm_start, settings)
     pilots = preset.pilots if previous is None else FOLLOWING_PILOTS
+    if settings.time_budget_s is not None and previous is None:
+        # Those of draft are enough by themselves where there is no time for others.
+        pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
     asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
     evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):

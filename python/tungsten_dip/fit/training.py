@@ -183,11 +183,15 @@ def train(
         return error, held_out_error(start.evidence, fused_a, fused_b, probe)
 
     every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
+    begun, deadline = time.perf_counter(), started + (settings.time_budget_s or math.inf)
+    left_s = max(deadline - begun, 1e-9)
     best, best_weights, since_best = (estimate(0)[1], network.weights(), 0) if warm else (math.inf, {}, 0)
     try:
         for step in range(1, steps + 1):
             rate = min(1.0, step / _WARM_UP_STEPS)
-            rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * (step - 1) / steps)
+            # What the learning rate anneals over is what ends first: the steps or the budget.
+            gone = max((step - 1) / steps, min((time.perf_counter() - begun) / left_s, 1.0))
+            rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * gone)
             batch = rng.integers(2 * len(trained), size=min(BATCH_PIXELS, 2 * len(trained)))
             network.step(batch // len(trained), trained[batch % len(trained)], LEARNING_RATE * rate)
             done.steps_done = step
@@ -202,7 +206,7 @@ def train(
             if error <= (settings.target_error or -math.inf):
                 done.notes.append(f"stopped at step {step}: the target error is reached")
                 break
-            if time.perf_counter() - started > (settings.time_budget_s or math.inf):
+            if time.perf_counter() > deadline:
                 done.notes.append(f"stopped at step {step}: the time budget is spent")
                 break
             if since_best >= _WARM_PATIENCE:
