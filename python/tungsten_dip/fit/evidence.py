@@ -60,7 +60,7 @@ _CONVERGED = 1e-5
 """relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
 _LOG_OFFSET = 0.02
-_SCORE_RADII = (2, 4, 8)
+_SCORE_RADII = (2, 4, 8, 16)
 PLANES_RADIUS = max(_SCORE_RADII)
 _NOISE_RADIUS = 8
 _OUTLIER = 20.0

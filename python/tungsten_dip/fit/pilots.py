@@ -85,13 +85,11 @@ BALANCED_PILOTS = (
     Pilot(10, k=2.0, step=2, with_position=True),
     Pilot(18, k=1.5, step=2, with_position=True),
 )
+# Larger windows leave fewer blotches on smooth walls and in fog.
 FINAL_PILOTS = (
     *BALANCED_PILOTS,
-    Pilot(2, k=1.0),
-    Pilot(5, k=0.5),
-    Pilot(10, k=0.5, step=2),
-    Pilot(10, k=1.0, step=2, with_position=True),
-    Pilot(24, k=1.0, step=3, with_position=True),
+    Pilot(24, step=3, with_position=True),
+    Pilot(32, k=2.0, step=4, with_position=True),
 )
 
 FOLLOWING_PILOTS = (
