@@ -302,6 +302,14 @@ def test_within_a_time_budget_the_pilots_of_draft_come_first(render: SyntheticRe
     assert set(pilots) == {*DRAFT_PILOTS, *BALANCED_PILOTS}
 
 
+def test_windows_as_large_as_the_image_are_left_out(make_render: MakeRender) -> None:
+    render = make_render(height=32, width=48)
+    result = denoise(render.buffers, _settings(preset="final", iterations=2))
+    assert result.model is not None
+    assert result.model.layout is not None
+    assert result.model.layout.pilots == BALANCED_PILOTS
+
+
 def test_the_target_error_ends_the_training(render: SyntheticRender) -> None:
     result = denoise(render.buffers, _settings(iterations=100_000, target_error=0.5))
     _check(result, render.buffers)

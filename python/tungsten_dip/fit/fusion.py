@@ -39,6 +39,9 @@ from tungsten_dip.progress import Progress, silent
 
 _CHUNK_PIXELS = 1 << 18
 
+_LARGE_RADIUS = 18
+"""Windows of a larger radius are left out where they would cover the whole image."""
+
 
 @dataclass(frozen=True)
 class _Preset:
@@ -67,6 +70,9 @@ def fit_fusion(
     if warm_start is not None:
         check_settings(warm_start, settings)
     pilots = preset.pilots if previous is None else FOLLOWING_PILOTS
+    # One model of first order cannot stand for a whole image.
+    largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)
+    pilots = tuple(pilot for pilot in pilots if pilot.radius <= largest)
     if settings.time_budget_s is not None and previous is None:
         # Those of draft are enough by themselves where there is no time for others.
         pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
