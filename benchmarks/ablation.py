@@ -6,6 +6,7 @@ prints a Markdown table, one row per variant. Run it on a machine with nothing e
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -14,6 +15,7 @@ from pathlib import Path
 from unittest import mock
 
 from tungsten_dip.bench.sets import read_sets
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
 from tungsten_dip.report.metrics import compare
 
@@ -76,4 +78,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as problem:
+        sys.exit(f"{sys.argv[0]}: {problem}")

@@ -6,11 +6,13 @@ prints a Markdown table with a row per sequence. The first frame counts only as 
 """
 
 import argparse
+import sys
 from itertools import pairwise
 
 import numpy as np
 
 from tungsten_dip.buffers import FloatImage, read_image
+from tungsten_dip.errors import InputError
 from tungsten_dip.report.metrics import compare
 from tungsten_dip.sequence.flicker import flicker
 from tungsten_dip.sequence.frames import find_frames
@@ -29,6 +31,10 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for pattern in options.sequences:
         images = _images(pattern)
+        if len(images) < 2:
+            raise InputError(f"{pattern}: expected two frames or more, found {len(images)}")
+        for number in images.keys() - references.keys():
+            raise InputError(f"{pattern}: there is no reference of frame {number} in {options.references}")
         found = [compare(image, references[number]) for number, image in images.items()][1:]
         flickers = [
             flicker(images[n], images[before], references[n], references[before])
@@ -45,4 +51,7 @@ def _images(pattern: str) -> dict[int, FloatImage]:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as problem:
+        sys.exit(f"{sys.argv[0]}: {problem}")

@@ -6,12 +6,14 @@ prints a Markdown table. The image is looked at every 20 steps, before it yields
 """
 
 import argparse
+import sys
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
 from tungsten_dip.bench.sets import BenchSet, read_sets
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, fusion
 from tungsten_dip.fit.evidence import Evidence, Indices
 from tungsten_dip.fit.model import Model
@@ -67,4 +69,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as problem:
+        sys.exit(f"{sys.argv[0]}: {problem}")
