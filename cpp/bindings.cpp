@@ -101,7 +101,7 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
                                             copied_if_defective(half_a, defects.half_a, buffer.half_a),
                                             copied_if_defective(half_b, defects.half_b, buffer.half_b),
                                             copied_if_defective(variance, defects.variance, buffer.variance));
-    {
+    if (defects.any()) {
         const py::gil_scoped_release release;
         mend(buffer, quantity);
     }

@@ -73,6 +73,8 @@ struct BufferDefects {
     Defects half_a;
     Defects half_b;
     Defects variance;
+
+    [[nodiscard]] bool any() const { return mean.any() || half_a.any() || half_b.any() || variance.any(); }
 };
 
 BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads);

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "core.hpp"
+#include "fastest.hpp"
 
 namespace tungsten_dip {
 namespace {
@@ -188,6 +189,10 @@ Ratio measure_ratio(ConstImage a, ConstImage b, ConstImage variance, int threads
             .standard_error = ratio_spread / std::sqrt(pixels)};
 }
 
+TUNGSTEN_DIP_FASTEST void add_to(float* sums, const float* values, std::ptrdiff_t count) {
+    for (std::ptrdiff_t i = 0; i < count; ++i) sums[i] += values[i];
+}
+
 }  // namespace
 
 void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int threads) {
@@ -201,32 +206,29 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 
 void box_mean(ConstImage in, int radius, Image out, int threads) {
     if (radius < 0) throw std::invalid_argument("the radius must not be negative");
-    const auto first = [radius](int i) { return std::max(i - radius, 0); };
-    const auto last = [radius](int i, int size) { return std::min(i + radius, size - 1); };
-
     std::vector<float> pixels(static_cast<std::size_t>(in.size()));
     const Image across{
         .data = pixels.data(), .height = in.height, .width = in.width, .channels = in.channels};
     parallel_for(in.height, threads, [&](int y) {
+        float* sum = across.row(y);
+        for (int dx = -std::min(radius, in.width - 1); dx <= std::min(radius, in.width - 1); ++dx) {
+            const int first = std::max(-dx, 0);
+            const int end = std::min(in.width - dx, in.width);
+            add_to(sum + std::ptrdiff_t{first} * in.channels,
+                   in.row(y) + std::ptrdiff_t{first + dx} * in.channels,
+                   std::ptrdiff_t{end - first} * in.channels);
+        }
         for (int x = 0; x < in.width; ++x) {
-            const int begin = first(x);
-            const int end = last(x, in.width);
-            for (int c = 0; c < in.channels; ++c) {
-                float sum = 0;
-                for (int tap = begin; tap <= end; ++tap) sum += in.at(y, tap, c);
-                across.at(y, x, c) = sum / static_cast<float>(end - begin + 1);
-            }
+            const int count = std::min(x + radius, in.width - 1) - std::max(x - radius, 0) + 1;
+            for (int c = 0; c < in.channels; ++c) *sum++ /= static_cast<float>(count);
         }
     });
     parallel_for(in.height, threads, [&](int y) {
-        const int begin = first(y);
-        const int end = last(y, in.height);
+        const int begin = std::max(y - radius, 0);
+        const int end = std::min(y + radius, in.height - 1);
         float* sum = out.row(y);
         std::fill_n(sum, out.row_size(), 0.0F);
-        for (int tap = begin; tap <= end; ++tap) {
-            const float* row = across.row(tap);
-            for (std::ptrdiff_t i = 0; i < out.row_size(); ++i) sum[i] += row[i];
-        }
+        for (int tap = begin; tap <= end; ++tap) add_to(sum, across.row(tap), out.row_size());
         for (std::ptrdiff_t i = 0; i < out.row_size(); ++i) sum[i] /= static_cast<float>(end - begin + 1);
     });
 }

@@ -18,10 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
@@ -371,9 +373,12 @@ def network_inputs(evidence: Evidence) -> Array:
     height, width = evidence.halves[0].shape[:2]
     # Filled plane by plane: this is the largest array of a fit.
     inputs = np.empty((2, height * width, len(evidence.layout.planes)), np.float32)
-    for half in (0, 1):
+
+    def fill(half: int) -> None:
         for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
             column[:] = plane.ravel()
+
+    of_both_halves(fill, evidence.guidance[0].threads)
     return inputs
 
 
@@ -427,10 +432,10 @@ def estimate_error(
         relative = 1 / (output[part] ** 2 + epsilon)
         with np.errstate(over="ignore"):
             apart = [
-                (((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2) * relative).mean(axis=1)
+                channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
                 for a, b in pilots
             ]
-            variance[part] = np.minimum((squared[part] * relative).mean(axis=1), _LARGEST_ERROR)
+            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
             bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
     told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
@@ -478,7 +483,7 @@ def _told_by_halves(
     """
     a, b = (image.reshape(-1, 3)[pixels] for image in witnesses)
     crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
-    error = _relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon).mean(axis=1)
+    error = channel_mean(_relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
     spread = float(error.std(dtype=np.float64))
     return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
 
@@ -596,7 +601,7 @@ def _unscaled(image: FloatImage, scale: float) -> FloatImage:
 
 def _denominators(smooth: Halves) -> Halves:
     """What squared errors are relative to, per half, shape (height, width, 1)."""
-    a, b = (_channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
+    a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
     return a, b
 
 
@@ -607,14 +612,8 @@ def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
 
 
 def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
-    error: FloatImage = _channel_mean((image - other) ** 2) / denominator
+    error: FloatImage = channel_mean((image - other) ** 2) / denominator
     return error
-
-
-def _channel_mean(image: FloatImage) -> FloatImage:
-    """Return the mean of three channels, shape (height, width, 1), faster than numpy's along a short axis."""
-    mean: FloatImage = (image[..., 0] + image[..., 1] + image[..., 2])[..., None] * np.float32(1 / 3)
-    return mean
 
 
 def _capped(error: FloatImage, threads: int) -> FloatImage:
@@ -624,7 +623,7 @@ def _capped(error: FloatImage, threads: int) -> FloatImage:
 
 
 def _log_level(image: FloatImage) -> FloatImage:
-    log_level: FloatImage = np.log(_channel_mean(image) + np.float32(_LOG_OFFSET))
+    log_level: FloatImage = np.log(channel_mean(image) + np.float32(_LOG_OFFSET))
     return log_level
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 
@@ -92,12 +93,7 @@ FINAL_PILOTS = (
     Pilot(32, k=2.0, step=4, with_position=True),
 )
 
-FOLLOWING_PILOTS = (
-    Pilot(1),
-    EDGES,
-    Pilot(6, k=2.0, step=2),
-    Pilot(12, step=2, with_position=True),
-)
+FOLLOWING_PILOTS = (Pilot(1), EDGES, Pilot(4, k=1.0), Pilot(6, k=2.0, step=2))
 """Enough beside what the previous frame shows. The first stands where that shows nothing."""
 
 
@@ -184,7 +180,7 @@ def guidance_of_halves(
         emission = smooth_emission = np.zeros(shown[half].shape, np.float32)
         if filtered.albedo is not None:
             smooth = _planes(filtered.albedo, len(colors))[half]
-            black = smooth.mean(axis=2, keepdims=True, dtype=np.float64) < _BLACK_ALBEDO
+            black = channel_mean(smooth) < _BLACK_ALBEDO
             albedo = np.where(black, np.float32(1), np.clip(smooth, 0, 1) + np.float32(_LEAST_ALBEDO))
             emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
             smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.fit.settings import RELMSE_EPSILON
 
@@ -58,7 +59,7 @@ def with_what_was_lost(halves: _Pair, fused: _Pair) -> _Pair:
 
 
 def _level(image: FloatImage) -> FloatImage:
-    level: FloatImage = (image[..., 0] + image[..., 1] + image[..., 2]) / np.float32(3) + np.float32(_BLACK)
+    level: FloatImage = channel_mean(image)[..., 0] + np.float32(_BLACK)
     return level
 
 

@@ -23,6 +23,7 @@ from tungsten_dip.fit.evidence import (
     planes_of_half,
     result_from_fused,
 )
+from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes, source_sha256
 from tungsten_dip.fit.settings import FitResult, FitSettings
@@ -35,6 +36,8 @@ from tungsten_dip.progress import Progress, silent
 _LOG = logging.getLogger(__name__)
 
 _BAND_PIXELS = 1 << 18
+_RUN_PIXELS = 1 << 13
+"""Pixels that the network sees at once: what its layers leave stays in the processor's cache."""
 
 
 def infer(
@@ -137,18 +140,28 @@ def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
     session = session_from_proto(graph_of(model, metadata={}), threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
-    fused_a, fused_b = np.empty_like(evidence.mean), np.empty_like(evidence.mean)
-    for first in range(0, height, rows):
-        end = min(first + rows, height)
-        # The planes of a row come from the rows around it.
-        above, below = max(first - PLANES_RADIUS, 0), min(end + PLANES_RADIUS, height)
-        around, band = evidence.rows(above, below), evidence.rows(first, end)
-        for half, fused in enumerate((fused_a, fused_b)):
-            planes = [plane[first - above : end - above] for plane in planes_of_half(around, half)]
-            pilots = [pilot[half].transpose(2, 0, 1) for pilot in band.pilots]
-            feeds = {"inputs": np.stack(planes)[None], "pilots": np.stack(pilots)[None]}
-            fused[first:end] = _finite(session.run(["color"], feeds)[0])[0].transpose(1, 2, 0)
-    return fused_a, fused_b
+    rows_at_once = max(1, _RUN_PIXELS // width)
+
+    def of_half(half: int) -> FloatImage:
+        fused = np.empty_like(evidence.mean)
+        inputs = np.empty((len(model.planes), min(rows, height), width), np.float32)
+        for first in range(0, height, rows):
+            end = min(first + rows, height)
+            # The planes of a row come from the rows around it.
+            above, below = max(first - PLANES_RADIUS, 0), min(end + PLANES_RADIUS, height)
+            for index, plane in enumerate(planes_of_half(evidence.rows(above, below), half)):
+                inputs[index, : end - first] = plane[first - above : end - above]
+            for row in range(first, end, rows_at_once):
+                part = slice(row, min(row + rows_at_once, end))
+                pilots = [pilot[half][part].transpose(2, 0, 1) for pilot in evidence.pilots]
+                feeds = {
+                    "inputs": np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first]),
+                    "pilots": np.stack(pilots)[None],
+                }
+                fused[part] = _finite(session.run(["color"], feeds)[0])[0].transpose(1, 2, 0)
+        return fused
+
+    return of_both_halves(of_half, threads)
 
 
 def _infer_paper(

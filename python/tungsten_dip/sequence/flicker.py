@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.fit.settings import RELMSE_EPSILON
 
@@ -51,9 +52,9 @@ def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_n
     d_fused_a, d_fused_b = fused[0] - previous[0], fused[1] - previous[1]
     d_a, d_b = noisy[0] - previous_noisy[0], noisy[1] - previous_noisy[1]
     denominator = _denominator(_mean(fused), _mean(previous))
-    spread = ((d_fused_a - d_fused_b) ** 2 / 4 / denominator).mean(axis=2)
+    spread = channel_mean((d_fused_a - d_fused_b) ** 2 / 4 / denominator)
     crossed = (d_fused_a - d_b) ** 2 + (d_fused_b - d_a) ** 2 - (d_a - d_b) ** 2
-    unbiased = (crossed / 2 / denominator).mean(axis=2) - spread
+    unbiased = channel_mean(crossed / 2 / denominator) - spread
     mean = float(unbiased.mean(dtype=np.float64))
     if float(unbiased.std(dtype=np.float64)) < _SURE * mean * math.sqrt(unbiased.size):
         return mean

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
@@ -158,7 +159,7 @@ def _divisor(buffers: RenderBuffers) -> FloatImage | np.float32:
     if buffers.albedo is None:
         return np.float32(1)
     albedo = buffers.albedo.mean
-    black = albedo.mean(axis=2, keepdims=True) < _BLACK_ALBEDO
+    black = channel_mean(albedo) < _BLACK_ALBEDO
     return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
 
 
