@@ -33,6 +33,8 @@ _LOCAL_WORKERS = {
     # By default glibc hands all memory back at once, and a fit, which takes it again, needs twice the time.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
     "distributed.worker.profile.enabled": False,
+    # Frames are long: none waits at a worker while another worker has nothing to do.
+    "distributed.scheduler.worker-saturation": 1.0,
 }
 
 
@@ -87,15 +89,17 @@ def _done(
         # No frame helps another but by its network: rather than wait for one, every worker fits one.
         leads = [[frame] for frame in frames[:count]]
         length = 1
-    tasks = {
-        client.submit(denoise_frames, lead, run, models, key=_key(lead), pure=False): lead for lead in leads
-    }
+    group = f"frames-{os.urandom(4).hex()}"
+    tasks = {client.submit(denoise_frames, lead, run, models, pure=False): lead for lead in leads}
     first = next(iter(tasks))
     shared = client.submit(itemgetter(1), first, pure=False)
     rest = frames[sum(map(len, leads)) :]
     for start in range(0, len(rest), length):
         part = rest[start : start + length]
-        tasks[client.submit(denoise_frames, part, run, shared, key=_key(part), pure=False)] = part
+        # Tasks whose keys say that they are alike wait at the scheduler until a worker is free.
+        tasks[
+            client.submit(denoise_frames, part, run, shared, key=(group, start), pure=False, priority=-start)
+        ] = part
     for task in as_completed(tasks):
         if task.status == "finished":
             records, found = task.result()
@@ -143,7 +147,3 @@ def _absolute(frame: Frame) -> Frame:
         absolute(frame.output),
         None if frame.scene is None else absolute(frame.scene),
     )
-
-
-def _key(frames: Sequence[Frame]) -> str:
-    return f"frames {frames[0].number}-{frames[-1].number} {os.urandom(4).hex()}"
