@@ -22,6 +22,7 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.neighbours import mean_around
@@ -129,8 +130,9 @@ class Evidence:
     """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``pilots`` holds what each pilot makes of both halves, the
-    noisy halves themselves first. ``noises`` is the relative squared difference, shape (height, width, 1), of
-    the reference pilot and the half that it has not seen, in the pixels around each.
+    noisy halves themselves first, and ``whole`` what it makes of all samples (empty where that is not asked
+    for). ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and
+    the half that it has not seen, in the pixels around each.
     """
 
     scale: float
@@ -138,6 +140,7 @@ class Evidence:
     guidance: tuple[Guidance, ...]
     layout: Layout
     pilots: tuple[Halves, ...]
+    whole: tuple[FloatImage, ...]
     noises: Halves
     notes: tuple[str, ...]
 
@@ -163,6 +166,7 @@ class Evidence:
             mean=self.mean[first:end],
             guidance=(a, b),
             pilots=tuple(cut(pilot) for pilot in self.pilots),
+            whole=tuple(image[first:end] for image in self.whole),
             noises=cut(self.noises),
         )
 
@@ -248,8 +252,8 @@ def evidence_from_buffers(
             colors = (_scaled(color.mean, scale),)
             guidance = guidance_of_halves(buffers, colors, scale, threads)
             progress(0.2, "features")
-            guides, irradiances, noise = first_guides(colors, variance, guidance)
-            (image,) = pilot_images(_ONLY_PILOT, colors, irradiances, guides, noise, guidance)
+            guides = first_guides(colors, variance, guidance)
+            (image,) = pilot_images(_ONLY_PILOT, colors, guides, guidance)
             image = _unscaled(image, scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
@@ -271,10 +275,10 @@ def evidence_from_buffers(
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
     if previous is None:
-        guides, irradiances, noise = first_guides(halves, variance, guidance)
+        guides = first_guides(halves, variance, guidance)
     else:
         moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
-        guides, irradiances, noise, first, filled = following_guides(halves, moved, guidance)
+        guides, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):
@@ -284,7 +288,7 @@ def evidence_from_buffers(
         if layout is None and index > 0 and late:
             break
         if pilot not in computed:
-            image_a, image_b = pilot_images(pilot, halves, irradiances, guides, noise, guidance)
+            image_a, image_b = pilot_images(pilot, halves, guides, guidance)
             computed[pilot] = image_a * something, image_b * something
         images.append(computed[pilot])
     described = described[: len(images) - 1]
@@ -299,7 +303,34 @@ def evidence_from_buffers(
         candidate_count = len(images) - 1 - len(described)
         layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], threads)
-    return Evidence(scale, mean, guidance, layout, tuple(images), noises, tuple(notes))
+    evidence = Evidence(scale, mean, guidance, layout, tuple(images), (), noises, tuple(notes))
+    late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
+    if settings.preset == "draft" or previous is not None or late:
+        return evidence
+    progress(0.7, "all samples")
+    return replace(evidence, whole=_of_all_samples(evidence, buffers, settings, guides.noise))
+
+
+def _of_all_samples(
+    evidence: Evidence, buffers: RenderBuffers, settings: FitSettings, noise_of_half: FloatImage
+) -> tuple[FloatImage, ...]:
+    """Return what the pilots make of all samples, with less noisy features and guides than a half's."""
+    colors = (evidence.mean,)
+    guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.guidance[0].threads)
+    a, b = evidence.halves
+    guides = first_guides(colors, np.float32(0.25) * (a - b) ** 2, guidance)
+    guides = replace(guides, noise=noise_of_half / np.float32(2))
+    something = _something(evidence.halves, buffers)
+    pilots = evidence.layout.pilots
+    computed = [pilot_images(pilot, colors, guides, guidance)[0] * something for pilot in pilots]
+    handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
+    if settings.pilot == "oidn":
+        albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
+        image = oidn_image(
+            evidence.mean / np.float32(evidence.scale), albedo, normal, threads=settings.threads
+        )
+        handed_in[-1] = np.maximum(_scaled(image, evidence.scale), 0)
+    return (evidence.mean, *computed, *handed_in)
 
 
 def with_best_reference(evidence: Evidence) -> Evidence:
@@ -491,18 +522,24 @@ def _told_by_halves(
 def result_from_fused(
     evidence: Evidence,
     fused: Halves,
+    whole: FloatImage | None,
     settings: FitSettings,
     started: float,
     iterations: int,
     history: Sequence[HistoryPoint] = (),
     notes: Sequence[str] = (),
 ) -> FitResult:
-    """Make the result of what the network made of each half, or of the input if that is as good."""
+    """Make the result of what the network made of each half, or of the input if that is as good.
+
+    ``whole`` is what its weights for both halves, in the mean, make of all samples.
+    """
     threads = evidence.guidance[0].threads
     shape = fused[0].shape
     fused = with_what_was_lost(evidence.halves, fused)
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
     image = np.float32(0.5) * (fused[0] + fused[1])
+    if whole is not None:
+        image = with_all_samples(fused, whole, threads)
     error = estimate_error(evidence, fused_a, fused_b).reshape(*shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.

@@ -86,11 +86,16 @@ def fit_fusion(
         network = _TorchNetwork(start.weights, start.examples, device)
         steps = settings.iterations or preset.steps
         training = train(network, start, settings, steps, started, progress)
-        fused = network.fuse_all(0), network.fuse_all(1)
-    shape = evidence.mean.shape
+        shape = evidence.mean.shape
+        fused = network.fuse_all(0).reshape(shape), network.fuse_all(1).reshape(shape)
+        whole = None
+        if evidence.whole:
+            by_a, by_b = (network.fuse_all(half, evidence.whole).reshape(shape) for half in (0, 1))
+            whole = np.float32(0.5) * (by_a + by_b)
     result = result_from_fused(
         start.evidence,
-        (fused[0].reshape(shape), fused[1].reshape(shape)),
+        fused,
+        whole,
         settings,
         started,
         training.steps_done,
@@ -135,21 +140,28 @@ class _TorchNetwork:
     def gradients(self, half: Indices, pixel: Indices) -> Sequence[Tensor]:
         """Return the gradients of the mean weighted squared error in the parameters."""
         at = torch.from_numpy(half * self._pixels + pixel)
-        squared = (self._fuse(at) - self._gathered(self._wanted, at)) ** 2
+        fused = self._fuse(at, self._gathered(self._choices, at))
+        squared = (fused - self._gathered(self._wanted, at)) ** 2
         loss = (squared * self._gathered(self._weight, at)).mean()
         return torch.autograd.grad(loss, self._parameters)
 
     @torch.no_grad()
-    def fuse(self, half: int, pixel: Indices | slice) -> Array:
-        """Return the weighted mean of the pilots, shape (pixels, 3)."""
+    def fuse(self, half: int, pixel: Indices | slice, images: Sequence[FloatImage] = ()) -> Array:
+        """Return the weighted mean of the pilots or, by the same weights, of ``images``; (pixels, 3)."""
         within = np.arange(self._pixels)[pixel]
-        fused: FloatImage = self._fuse(torch.from_numpy(half * self._pixels + within)).cpu().numpy()
+        at = torch.from_numpy(half * self._pixels + within)
+        choices = self._gathered(self._choices, at)
+        if images:
+            parts = [image.reshape(-1, 3)[pixel] for image in images]
+            choices = torch.from_numpy(np.stack(parts, axis=1)).to(self._device)
+        fused: FloatImage = self._fuse(at, choices).cpu().numpy()
         return fused
 
-    def fuse_all(self, half: int) -> Array:
+    def fuse_all(self, half: int, images: Sequence[FloatImage] = ()) -> Array:
         """Return `fuse` of every pixel, not all at once."""
         firsts = range(0, self._pixels, _CHUNK_PIXELS)
-        return np.concatenate([self.fuse(half, slice(first, first + _CHUNK_PIXELS)) for first in firsts])
+        parts = [slice(first, first + _CHUNK_PIXELS) for first in firsts]
+        return np.concatenate([self.fuse(half, part, images) for part in parts])
 
     def weights(self) -> Weights:
         """Return a copy of the weights, shaped as those of 1x1 convolutions."""
@@ -165,7 +177,7 @@ class _TorchNetwork:
         for name, value in zip(self._names, self._parameters, strict=True):
             value.copy_(torch.from_numpy(weights[name].reshape(value.shape)))
 
-    def _fuse(self, at: Tensor) -> Tensor:
+    def _fuse(self, at: Tensor, choices: Tensor) -> Tensor:
         # Pixels last: a softmax over a short last axis crawls.
         x = self._gathered(self._inputs, at).t()
         layers = list(zip(self._parameters[::2], self._parameters[1::2], strict=True))
@@ -173,8 +185,7 @@ class _TorchNetwork:
             if index:
                 x = nn.functional.leaky_relu(x, LEAKY_SLOPE)
             x = torch.addmm(bias[:, None], weight, x)
-        choices = self._gathered(self._choices, at).permute(1, 2, 0)
-        return (x.softmax(0)[:, None] * choices).sum(0).t()
+        return (x.softmax(0)[:, None] * choices.permute(1, 2, 0)).sum(0).t()
 
     def _gathered(self, values: Tensor, at: Tensor) -> Tensor:
         return values.index_select(0, at).to(self._device)

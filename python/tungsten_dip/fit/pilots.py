@@ -133,6 +133,18 @@ class Guidance:
         return color
 
 
+@dataclass(frozen=True)
+class Guides:
+    """What the guided pilots compare: ``images``, log radiance, one for each half or for the mean.
+
+    ``noise`` is the variance of one of them, shape (height, width, 3), ``irradiances`` what is smoothed.
+    """
+
+    images: tuple[FloatImage, ...]
+    noise: FloatImage
+    irradiances: tuple[FloatImage, ...]
+
+
 def guidance_of_halves(
     buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
 ) -> tuple[Guidance, ...]:
@@ -229,34 +241,33 @@ def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
 
 def first_guides(
     colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: tuple[Guidance, ...]
-) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, ...], FloatImage]:
-    """Return (guides, demodulated colours, guide variance) for the guided pilots.
+) -> Guides:
+    """Return the guides of the two halves, or of the mean alone.
 
-    ``colors`` are the two halves, or the mean alone where there are no halves that can be trusted; then
-    ``variance`` (of the mean, same shape) says how noisy it is, and its own residual does where it is None.
+    How noisy guides are is told by the difference of the halves'. Of the mean alone, ``variance`` (of the
+    mean, same shape) tells it, and its own residual does where that is None.
     """
     irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     first = FIRST_GUIDE if guidance[0].penalty else FIRST_GUIDE_WITHOUT_FEATURES
-    guides = tuple(
+    smooth = tuple(
         np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
     )
-    guides, noise = _guides(guides, irradiances, variance, guidance[0])
+    guides = _guides(smooth, irradiances, variance, guidance[0])
     second = Pilot(radius=8, k=1.0, step=2)
-    guides = tuple(
-        np.maximum(_regress(image, second, g, guide, noise), 0)
-        for image, guide, g in zip(irradiances, guides, guidance, strict=True)
+    smooth = tuple(
+        np.maximum(_regress(image, second, g, guide, guides.noise), 0)
+        for image, guide, g in zip(irradiances, guides.images, guidance, strict=True)
     )
-    guides, noise = _guides(guides, irradiances, variance, guidance[0])
-    return guides, irradiances, noise
+    return _guides(smooth, irradiances, variance, guidance[0])
 
 
 def following_guides(
     colors: _Pair, previous: _Pair, guidance: tuple[Guidance, ...]
-) -> tuple[_Pair, _Pair, FloatImage, _Pair, _Pair]:
-    """Return (guides, demodulated colours, guide variance) as `first_guides`, at a part of its cost.
+) -> tuple[Guides, _Pair, _Pair]:
+    """Return guides as `first_guides`, at a part of its cost.
 
     ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the
-    guide, filled by the first of `FOLLOWING_PILOTS`; both come with it: (..., first pilot, filled previous).
+    guide, filled by the first of `FOLLOWING_PILOTS`; both come as well: (guides, first pilot, filled).
     """
     irradiance_a, irradiance_b = (g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     irradiances = irradiance_a, irradiance_b
@@ -272,17 +283,12 @@ def following_guides(
         np.maximum((image - g.smooth_emission) / g.albedo, 0)
         for image, g in zip((filled_a, filled_b), guidance, strict=True)
     )
-    (guide_a, guide_b), noise = _guides(shown, irradiances, None, guidance[0])
-    return (guide_a, guide_b), irradiances, noise, (first_a, first_b), (filled_a, filled_b)
+    guides = _guides(shown, irradiances, None, guidance[0])
+    return guides, (first_a, first_b), (filled_a, filled_b)
 
 
 def pilot_images(
-    pilot: Pilot,
-    colors: tuple[FloatImage, ...],
-    irradiances: tuple[FloatImage, ...],
-    guides: tuple[FloatImage, ...],
-    guide_variance: FloatImage,
-    guidance: tuple[Guidance, ...],
+    pilot: Pilot, colors: tuple[FloatImage, ...], guides: Guides, guidance: tuple[Guidance, ...]
 ) -> tuple[FloatImage, ...]:
     """Denoise every half by one pilot; return linear radiance, shape (height, width, 3), never negative."""
     if pilot.along_edges:
@@ -291,8 +297,8 @@ def pilot_images(
             for color, g in zip(colors, guidance, strict=True)
         )
     return tuple(
-        g.color(_regress(image, pilot, g, guide, guide_variance))
-        for image, guide, g in zip(irradiances, guides, guidance, strict=True)
+        g.color(_regress(image, pilot, g, guide, guides.noise))
+        for image, guide, g in zip(guides.irradiances, guides.images, guidance, strict=True)
     )
 
 
@@ -310,7 +316,7 @@ def _guides(
     irradiances: tuple[FloatImage, ...],
     variance: FloatImage | None,
     guidance: Guidance,
-) -> tuple[tuple[FloatImage, ...], FloatImage]:
+) -> Guides:
     guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
     if len(guides) == 2:
         noise = (guides[0] - guides[1]) ** 2 / 2
@@ -318,7 +324,7 @@ def _guides(
         squared = variance / guidance.albedo**2 if variance is not None else (irradiances[0] - images[0]) ** 2
         noise = squared / (_SAMPLES_OF_FIRST_WINDOW * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
     noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, guidance.threads)
-    return guides, noise + np.float32(_LEAST_GUIDE_VARIANCE)
+    return Guides(guides, noise + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
 
 
 def _regress(

@@ -98,9 +98,9 @@ def _infer_fusion(
     training = Training()
     if refit_steps:
         model, evidence, training = _refitted(model, evidence, settings, refit_steps, started, progress)
-    fused = _fused(model, evidence, settings.threads or 0)
+    fused, whole = _fused(model, evidence, settings.threads or 0)
     result = result_from_fused(
-        evidence, fused, settings, started, training.steps_done, training.history, training.notes
+        evidence, fused, whole, settings, started, training.steps_done, training.history, training.notes
     )
     if training.steps_done:
         model = replace(
@@ -135,15 +135,18 @@ def _refitted(
     return refitted, start.evidence, training
 
 
-def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
-    """Return what the network makes of both halves, band by band of rows."""
+def _fused(model: Model, evidence: Evidence, threads: int) -> tuple[Halves, FloatImage | None]:
+    """Return what the network makes of both halves, and of all samples if known, band by band of rows."""
     session = session_from_proto(graph_of(model, metadata={}), threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     rows_at_once = max(1, _RUN_PIXELS // width)
 
-    def of_half(half: int) -> FloatImage:
-        fused = np.empty_like(evidence.mean)
+    def of_half(half: int) -> tuple[FloatImage, ...]:
+        choices = [[pilot[half] for pilot in evidence.pilots]]
+        if evidence.whole:
+            choices.append(list(evidence.whole))
+        fused = tuple(np.empty_like(evidence.mean) for _ in choices)
         inputs = np.empty((len(model.planes), min(rows, height), width), np.float32)
         for first in range(0, height, rows):
             end = min(first + rows, height)
@@ -153,15 +156,16 @@ def _fused(model: Model, evidence: Evidence, threads: int) -> Halves:
                 inputs[index, : end - first] = plane[first - above : end - above]
             for row in range(first, end, rows_at_once):
                 part = slice(row, min(row + rows_at_once, end))
-                pilots = [pilot[half][part].transpose(2, 0, 1) for pilot in evidence.pilots]
-                feeds = {
-                    "inputs": np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first]),
-                    "pilots": np.stack(pilots)[None],
-                }
-                fused[part] = _finite(session.run(["color"], feeds)[0])[0].transpose(1, 2, 0)
+                seen = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
+                for image, images in zip(fused, choices, strict=True):
+                    pilots = np.stack([pilot[part].transpose(2, 0, 1) for pilot in images])[None]
+                    color = session.run(["color"], {"inputs": seen, "pilots": pilots})[0]
+                    image[part] = _finite(color)[0].transpose(1, 2, 0)
         return fused
 
-    return of_both_halves(of_half, threads)
+    (half_a, *by_a), (half_b, *by_b) = of_both_halves(of_half, threads)
+    whole = np.float32(0.5) * (by_a[0] + by_b[0]) if evidence.whole else None
+    return (half_a, half_b), whole
 
 
 def _infer_paper(
