@@ -48,6 +48,7 @@ VARIANTS: dict[str, Change] = {
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         pilots, "_along_edges", lambda image, *_: image
     ),
+    "no pilots of all samples": lambda: mock.patch.object(fusion, "pilots_of_all_samples", return_value=()),
     "empty space like any other": lambda: mock.patch.object(evidence, "_something", return_value=1),
 }
 

@@ -130,9 +130,9 @@ class Evidence:
     """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``pilots`` holds what each pilot makes of both halves, the
-    noisy halves themselves first, and ``whole`` what it makes of all samples (empty where that is not asked
-    for). ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and
-    the half that it has not seen, in the pixels around each.
+    noisy halves themselves first. ``noises`` is the relative squared difference, shape (height, width, 1), of
+    the reference pilot and the half that it has not seen, in the pixels around each. ``guide_noise`` is that
+    of the pilots' guides (see `Guides`).
     """
 
     scale: float
@@ -140,8 +140,8 @@ class Evidence:
     guidance: tuple[Guidance, ...]
     layout: Layout
     pilots: tuple[Halves, ...]
-    whole: tuple[FloatImage, ...]
     noises: Halves
+    guide_noise: FloatImage
     notes: tuple[str, ...]
 
     @property
@@ -166,8 +166,8 @@ class Evidence:
             mean=self.mean[first:end],
             guidance=(a, b),
             pilots=tuple(cut(pilot) for pilot in self.pilots),
-            whole=tuple(image[first:end] for image in self.whole),
             noises=cut(self.noises),
+            guide_noise=self.guide_noise[first:end],
         )
 
 
@@ -303,23 +303,24 @@ def evidence_from_buffers(
         candidate_count = len(images) - 1 - len(described)
         layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], threads)
-    evidence = Evidence(scale, mean, guidance, layout, tuple(images), (), noises, tuple(notes))
-    late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
-    if settings.preset == "draft" or previous is not None or late:
-        return evidence
-    progress(0.7, "all samples")
-    return replace(evidence, whole=_of_all_samples(evidence, buffers, settings, guides.noise))
+    return Evidence(scale, mean, guidance, layout, tuple(images), noises, guides.noise, tuple(notes))
 
 
-def _of_all_samples(
-    evidence: Evidence, buffers: RenderBuffers, settings: FitSettings, noise_of_half: FloatImage
+def pilots_of_all_samples(
+    evidence: Evidence, buffers: RenderBuffers, settings: FitSettings, started: float
 ) -> tuple[FloatImage, ...]:
-    """Return what the pilots make of all samples, with less noisy features and guides than a half's."""
+    """Return what the pilots make of all samples, with less noisy features and guides than a half's.
+
+    Returns nothing for the preset draft, or where the pilots themselves have used up their time.
+    """
+    late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
+    if settings.preset == "draft" or late:
+        return ()
     colors = (evidence.mean,)
     guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.guidance[0].threads)
     a, b = evidence.halves
     guides = first_guides(colors, np.float32(0.25) * (a - b) ** 2, guidance)
-    guides = replace(guides, noise=noise_of_half / np.float32(2))
+    guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
     something = _something(evidence.halves, buffers)
     pilots = evidence.layout.pilots
     computed = [pilot_images(pilot, colors, guides, guidance)[0] * something for pilot in pilots]

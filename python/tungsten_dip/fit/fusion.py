@@ -22,6 +22,7 @@ from tungsten_dip.fit.evidence import (
     Halves,
     Indices,
     evidence_from_buffers,
+    pilots_of_all_samples,
     result_from_fused,
 )
 from tungsten_dip.fit.model import Model, Weights, check_settings, source_sha256
@@ -81,6 +82,9 @@ def fit_fusion(
     if isinstance(evidence, FitResult):
         return evidence
     start = start_of_training(evidence, settings.seed, warm_start)
+    evidence = start.evidence
+    progress(0.7, "all samples")
+    whole_pilots = () if previous is not None else pilots_of_all_samples(evidence, buffers, settings, started)
     # The network is too small to share: on a busy machine threads would only wait for one another.
     with compute_device(settings, most_threads=1) as device:
         network = _TorchNetwork(start.weights, start.examples, device)
@@ -89,11 +93,11 @@ def fit_fusion(
         shape = evidence.mean.shape
         fused = network.fuse_all(0).reshape(shape), network.fuse_all(1).reshape(shape)
         whole = None
-        if evidence.whole:
-            by_a, by_b = (network.fuse_all(half, evidence.whole).reshape(shape) for half in (0, 1))
+        if whole_pilots:
+            by_a, by_b = (network.fuse_all(half, whole_pilots).reshape(shape) for half in (0, 1))
             whole = np.float32(0.5) * (by_a + by_b)
     result = result_from_fused(
-        start.evidence,
+        evidence,
         fused,
         whole,
         settings,
@@ -104,12 +108,12 @@ def fit_fusion(
     )
     model = Model(
         kind="pointwise",
-        planes=start.evidence.layout.planes,
+        planes=evidence.layout.planes,
         weights=network.weights(),
         settings=settings,
         estimated_relmse=result.estimated_relmse,
         source_sha256=source_sha256(buffers),
-        layout=start.evidence.layout,
+        layout=evidence.layout,
         standardisation=start.standardisation,
     )
     return replace(result, model=model)

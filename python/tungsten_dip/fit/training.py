@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Protocol
 
@@ -107,19 +107,25 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None = None)
         model.standardisation.apply(inputs)
         far_out = [float((np.abs(plane) >= LARGEST_INPUT).mean()) for plane in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
-            return Start(
-                evidence, _examples(evidence, inputs), model.standardisation, model.weights, warm=True
-            )
+            return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
         notes = ("the model knows no such images: a network is fitted anew",)
         evidence = with_best_reference(evidence)
         inputs = network_inputs(evidence)
     standardisation = standardisation_of(inputs)
     standardisation.apply(inputs)
     weights = first_weights(evidence.layout, seed)
-    return Start(evidence, _examples(evidence, inputs), standardisation, weights, warm=False, notes=notes)
+    return _start(evidence, inputs, standardisation, weights, warm=False, notes=notes)
 
 
-def _examples(evidence: Evidence, inputs: Array) -> Examples:
+def _start(
+    evidence: Evidence,
+    inputs: Array,
+    standardisation: Standardisation,
+    weights: Weights,
+    warm: bool,
+    notes: tuple[str, ...] = (),
+) -> Start:
+    """Return the start with its examples, whose copy of the pilots becomes the evidence's."""
     pixels = inputs.shape[1]
     choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
     for index, pilot in enumerate(evidence.pilots):
@@ -127,7 +133,11 @@ def _examples(evidence: Evidence, inputs: Array) -> Examples:
             choices[half, :, index] = pilot[half].reshape(pixels, 3)
     wanted = np.stack([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.stack([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
-    return Examples(inputs, choices, wanted, weight)
+    # One copy of the pilots is enough: large images need gigabytes for each.
+    shape = evidence.mean.shape
+    pilots = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
+    examples = Examples(inputs, choices, wanted, weight)
+    return Start(replace(evidence, pilots=pilots), examples, standardisation, weights, warm, notes)
 
 
 def first_weights(layout: Layout, seed: int) -> Weights:

@@ -20,6 +20,7 @@ from tungsten_dip.fit.evidence import (
     checked_candidates,
     checked_previous,
     evidence_from_buffers,
+    pilots_of_all_samples,
     planes_of_half,
     result_from_fused,
 )
@@ -98,7 +99,8 @@ def _infer_fusion(
     training = Training()
     if refit_steps:
         model, evidence, training = _refitted(model, evidence, settings, refit_steps, started, progress)
-    fused, whole = _fused(model, evidence, settings.threads or 0)
+    whole_pilots = () if previous is not None else pilots_of_all_samples(evidence, buffers, settings, started)
+    fused, whole = _fused(model, evidence, whole_pilots, settings.threads or 0)
     result = result_from_fused(
         evidence, fused, whole, settings, started, training.steps_done, training.history, training.notes
     )
@@ -135,8 +137,10 @@ def _refitted(
     return refitted, start.evidence, training
 
 
-def _fused(model: Model, evidence: Evidence, threads: int) -> tuple[Halves, FloatImage | None]:
-    """Return what the network makes of both halves, and of all samples if known, band by band of rows."""
+def _fused(
+    model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage], threads: int
+) -> tuple[Halves, FloatImage | None]:
+    """Return what the network makes of both halves, and of all samples if given, band by band of rows."""
     session = session_from_proto(graph_of(model, metadata={}), threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
@@ -144,8 +148,8 @@ def _fused(model: Model, evidence: Evidence, threads: int) -> tuple[Halves, Floa
 
     def of_half(half: int) -> tuple[FloatImage, ...]:
         choices = [[pilot[half] for pilot in evidence.pilots]]
-        if evidence.whole:
-            choices.append(list(evidence.whole))
+        if whole_pilots:
+            choices.append(list(whole_pilots))
         fused = tuple(np.empty_like(evidence.mean) for _ in choices)
         inputs = np.empty((len(model.planes), min(rows, height), width), np.float32)
         for first in range(0, height, rows):
@@ -164,7 +168,7 @@ def _fused(model: Model, evidence: Evidence, threads: int) -> tuple[Halves, Floa
         return fused
 
     (half_a, *by_a), (half_b, *by_b) = of_both_halves(of_half, threads)
-    whole = np.float32(0.5) * (by_a[0] + by_b[0]) if evidence.whole else None
+    whole = np.float32(0.5) * (by_a[0] + by_b[0]) if whole_pilots else None
     return (half_a, half_b), whole
 
 
