@@ -83,8 +83,10 @@ def fit_fusion(
         return evidence
     start = start_of_training(evidence, settings.seed, warm_start)
     evidence = start.evidence
-    progress(0.7, "all samples")
-    whole_pilots = () if previous is not None else pilots_of_all_samples(evidence, buffers, settings, started)
+    whole_pilots: tuple[FloatImage, ...] = ()
+    if previous is None:
+        progress(0.7, "all samples")
+        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
     # The network is too small to share: on a busy machine threads would only wait for one another.
     with compute_device(settings, most_threads=1) as device:
         network = _TorchNetwork(start.weights, start.examples, device)
