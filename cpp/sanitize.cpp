@@ -50,7 +50,7 @@ Rules variance_rules(Quantity quantity) {
 // Without a branch for each value, since nearly always this is all that is asked.
 TUNGSTEN_DIP_FASTEST bool all_sane(const float* values, std::ptrdiff_t count, Rules rules) {
     int insane = 0;
-    for (std::ptrdiff_t i = 0; i < count; ++i) insane |= static_cast<int>(!rules.sane(values[i]));
+    for (std::ptrdiff_t i = 0; i < count; ++i) insane += rules.sane(values[i]) ? 0 : 1;
     return insane == 0;
 }
 
