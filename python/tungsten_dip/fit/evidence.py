@@ -311,7 +311,9 @@ def pilots_of_all_samples(
 ) -> tuple[FloatImage, ...]:
     """Return what the pilots make of all samples, with less noisy features and guides than a half's.
 
-    Returns nothing for the preset draft, or where the pilots themselves have used up their time.
+    One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
+    all for the preset draft, or where the pilots of the halves have used up their share of the time budget,
+    which began at ``started`` (a value of time.perf_counter).
     """
     late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
     if settings.preset == "draft" or late:

@@ -66,7 +66,8 @@ def infer(
     if refit_steps < 0:
         raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
     # A FitSettings checks the threads as well.
-    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
+    # The time budget was the fit's: what a network makes of an image must not depend on the machine's speed.
+    settings = replace(model.settings, threads=threads, iterations=refit_steps or None, time_budget_s=None)
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, threads)
