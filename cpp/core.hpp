@@ -117,12 +117,18 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
 
 // --- prefilter.cpp
 
+// Where non-local means looks for pixels that are alike, and how many standard deviations apart those may be.
+struct SearchWindow {
+    int radius = 5;
+    float k = 0.5F;
+};
+
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
 // `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
 // after filtering. A value is passed through unchanged where it and the pixels next to it have no noise:
 // their halves agree and their variances are 0.
-void prefilter_feature(const Buffer& in, const Buffer& out, int threads);
+void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads);
 
 // --- regression.cpp
 

@@ -17,8 +17,6 @@ namespace {
 // Bitterli et al. 2016, section 5.1, and the denoiser that its authors released with Tungsten.
 constexpr int patch_radius = 3;
 constexpr std::size_t patch_size = 2 * std::size_t{patch_radius} + 1;
-constexpr int window_radius = 5;
-constexpr float k_squared = 0.5F * 0.5F;
 
 // Keeps distances finite where there is no variance: there, values that differ by less than 1e-4 or so are
 // equal.
@@ -98,15 +96,16 @@ struct HalvesRow {
 // they are padded, to the tile grown by a patch's radius.
 class TileFilter {
   public:
-    TileFilter(const Feature& feature, int top, int left)
+    TileFilter(const Feature& feature, SearchWindow window, int top, int left)
         : feature_(feature),
+          k_squared_(window.k * window.k),
           rows_{.begin = top, .end = std::min(top + tile_size, feature.a.height)},
           columns_{.begin = left, .end = std::min(left + tile_size, feature.a.width)},
           sums_(static_cast<std::size_t>(feature.a.channels * tile_size)),
           weights_(tile_size),
           patch_rows_(padded_size) {
-        for (int dy = -window_radius; dy <= window_radius; ++dy) {
-            for (int dx = -window_radius; dx <= window_radius; ++dx) add_offset(dy, dx);
+        for (int dy = -window.radius; dy <= window.radius; ++dy) {
+            for (int dx = -window.radius; dx <= window.radius; ++dx) add_offset(dy, dx);
         }
     }
 
@@ -127,6 +126,7 @@ class TileFilter {
 
   private:
     const Feature& feature_;
+    float k_squared_;
     Range rows_;
     Range columns_;
     std::vector<HalvesRow<tile_size>> sums_;        // [channel][row] weight * (value at the offset - value)
@@ -185,7 +185,7 @@ class TileFilter {
             for (std::size_t i = begin; i < end; ++i) {
                 const std::size_t j = i - begin;
                 const float noise = variance[j] + std::min(variance[j], variance_there[j]);
-                const float scale = share / (k_squared * (variance[j] + variance_there[j]) + epsilon);
+                const float scale = share / (k_squared_ * (variance[j] + variance_there[j]) + epsilon);
                 const float difference_a = a[j] - a_there[j];
                 const float difference_b = b[j] - b_there[j];
                 distances.a[i] += std::min((difference_a * difference_a - noise) * scale, largest_distance);
@@ -262,7 +262,7 @@ void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
 
 }  // namespace
 
-void prefilter_feature(const Buffer& in, const Buffer& out, int threads) {
+void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads) {
     estimate_variance_of_half(in, out.variance, threads);
     const Feature feature{
         .a = {in.half_a, threads}, .b = {in.half_b, threads}, .variance = {out.variance, threads}};
@@ -274,7 +274,8 @@ void prefilter_feature(const Buffer& in, const Buffer& out, int threads) {
     parallel_for(tile_rows * tile_columns, threads, [&](int tile) {
         const int top = tile / tile_columns * tile_size;
         const int left = tile % tile_columns * tile_size;
-        if (any_noise(feature, top, left)) TileFilter(feature, top, left).write(out.half_a, out.half_b);
+        if (any_noise(feature, top, left))
+            TileFilter(feature, window, top, left).write(out.half_a, out.half_b);
     });
 
     halves_variance(out.half_a, out.half_b, out.mean, threads);

@@ -66,7 +66,14 @@ def compare_halves(
     """Test the halves of a colour for independence."""
 
 def prefilter_feature(
-    mean: FloatImage, half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0
+    mean: FloatImage,
+    half_a: FloatImage,
+    half_b: FloatImage,
+    variance: FloatImage | None,
+    *,
+    radius: int = 5,
+    k: float = 0.5,
+    threads: int = 0,
 ) -> tuple[FloatImage, FloatImage, FloatImage, FloatImage]:
     """Return the cross-filtered (mean, half_a, half_b) of a feature and the variance that remains."""
 

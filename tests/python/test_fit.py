@@ -389,16 +389,16 @@ def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: Syn
     """What a half's features share with the colour that scores it would pass for truth."""
 
     def darkened(half: str) -> RenderBuffers:
-        # Albedos half as high in one half: weights of the pre-filter hardly change, values do.
+        # Albedos lower in one half by less than their noise: the pre-filter's weights hardly change, values do.
         albedo = render.buffers.albedo
         assert albedo is not None
         image = getattr(albedo, half)
         assert image is not None
-        return render.buffers.with_quantities(albedo=replace(albedo, **{half: image / 2}))
+        return render.buffers.with_quantities(albedo=replace(albedo, **{half: np.float32(0.98) * image}))
 
     plain, changed = _guidance(render.buffers), _guidance(darkened("half_b"))
-    assert np.abs(changed[1].albedo / plain[1].albedo - 1).mean() > 0.4
-    assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.05
+    assert np.abs(changed[1].albedo / plain[1].albedo - 1).mean() > 0.015
+    assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.0025
 
 
 def test_emitted_light_is_given_back(render: SyntheticRender) -> None:

@@ -516,7 +516,9 @@ def whole_metadata(value: str) -> Spoil:
     return spoil
 
 
-PILOT = '{"along_edges": false, "k": null, "radius": 1, "step": 1, "with_position": false}, '
+PILOT = (
+    '{"along_edges": false, "by_color": false, "k": null, "radius": 1, "step": 1, "with_position": false}, '
+)
 
 HOSTILE: list[tuple[Spoil, str]] = [
     (external, "within the file"),
@@ -541,7 +543,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (many_nodes, "too many parts"),
     (long_name, "beside the weights"),
     (no_metadata, "tungsten-dip wrote"),
-    (metadata('"format": 1', '"format": 2'), "expected format 1, found 2"),
+    (metadata('"format": 2', '"format": 1'), "expected format 2, found 1"),
     (metadata('"kind": "pointwise"', '"kind": "skip"'), "kind|network"),
     (metadata('"candidates": 0', '"candidates": 1000000000000'), "planes|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
@@ -559,7 +561,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (whole_metadata("[" * 100_000), "JSON"),
     (whole_metadata("{"), "JSON"),
     (whole_metadata("[]"), "format"),
-    (whole_metadata('{"format": 1}'), "kind"),
+    (whole_metadata('{"format": 2}'), "kind"),
 ]
 
 

@@ -7,6 +7,11 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import FEATURES, Buffer, RenderBuffers
 
+_PASSES = ((3, 0.35), (5, 0.5), (5, 0.7))
+"""Radius of the window, and standard deviations that pixels may differ by: what one pass leaves is compared
+with less noise by the next, which may look further and average more. One pass leaves what features of few
+samples show of lights' edges and mirrors as noisy as it is."""
+
 
 def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:
     """Return buffers whose features are filtered by non-local means, each half with the other's weights.
@@ -20,11 +25,13 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     for name in FEATURES:
         feature: Buffer | None = getattr(buffers, name)
         if feature is not None and feature.half_a is not None and feature.half_b is not None:
-            mean, *others = _core.prefilter_feature(
-                feature.mean, feature.half_a, feature.half_b, feature.variance, threads or 0
-            )
+            mean, half_a, half_b, variance = feature.mean, feature.half_a, feature.half_b, feature.variance
+            for radius, k in _PASSES:
+                mean, half_a, half_b, variance = _core.prefilter_feature(
+                    mean, half_a, half_b, variance, radius=radius, k=k, threads=threads or 0
+                )
             if name != "normal":
                 # Where negative values were mended, the mean is not that of the halves, and may fall below 0.
                 np.maximum(mean, 0, out=mean)
-            filtered[name] = Buffer(mean, *others)
+            filtered[name] = Buffer(mean, half_a, half_b, variance)
     return buffers.with_quantities(**filtered)

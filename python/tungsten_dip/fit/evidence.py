@@ -32,10 +32,10 @@ from tungsten_dip.fit.pilots import (
     FOLLOWING_PILOTS,
     Guidance,
     Pilot,
+    PilotMaker,
     first_guides,
     following_guides,
     guidance_of_halves,
-    pilot_images,
 )
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.fit.yielding import with_what_was_lost
@@ -253,7 +253,7 @@ def evidence_from_buffers(
             guidance = guidance_of_halves(buffers, colors, scale, threads)
             progress(0.2, "features")
             guides = first_guides(colors, variance, guidance)
-            (image,) = pilot_images(_ONLY_PILOT, colors, guides, guidance)
+            (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
             image = _unscaled(image, scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
@@ -280,6 +280,7 @@ def evidence_from_buffers(
         moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
         guides, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
+    maker = PilotMaker(halves, variance, guidance, guides)
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
@@ -288,7 +289,7 @@ def evidence_from_buffers(
         if layout is None and index > 0 and late:
             break
         if pilot not in computed:
-            image_a, image_b = pilot_images(pilot, halves, guides, guidance)
+            image_a, image_b = maker.images(pilot)
             computed[pilot] = image_a * something, image_b * something
         images.append(computed[pilot])
     described = described[: len(images) - 1]
@@ -321,11 +322,13 @@ def pilots_of_all_samples(
     colors = (evidence.mean,)
     guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.guidance[0].threads)
     a, b = evidence.halves
-    guides = first_guides(colors, np.float32(0.25) * (a - b) ** 2, guidance)
+    variance = np.float32(0.25) * (a - b) ** 2
+    guides = first_guides(colors, variance, guidance)
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
+    maker = PilotMaker(colors, variance, guidance, guides)
     something = _something(evidence.halves, buffers)
     pilots = evidence.layout.pilots
-    computed = [pilot_images(pilot, colors, guides, guidance)[0] * something for pilot in pilots]
+    computed = [maker.images(pilot)[0] * something for pilot in pilots]
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))

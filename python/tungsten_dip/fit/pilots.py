@@ -1,7 +1,8 @@
 """Pilots: closed-form guesses at the clean image, among which a network later chooses pixel by pixel.
 
 A pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
-window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`). Each half of the
+window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`), or it sees the
+colour alone. Each half of the
 samples is denoised from its own samples alone: what one half's pilots predict is scored by the other half,
 whose noise they have never seen.
 """
@@ -9,6 +10,7 @@ whose noise they have never seen.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +60,8 @@ class Pilot:
 
     ``along_edges``: no regression, but the mean along the edges of the features, with the standard deviation
     ``radius``. It shows how much of a pixel each surface covers better than the samples in the pixel do.
+    ``by_color``: without features and albedo, which on mirrors, in glass and out of focus are as noisy as the
+    colour.
     """
 
     radius: int
@@ -65,6 +69,7 @@ class Pilot:
     step: int = 1
     with_position: bool = False
     along_edges: bool = False
+    by_color: bool = False
 
 
 FIRST_GUIDE = Pilot(radius=3)
@@ -85,6 +90,7 @@ BALANCED_PILOTS = (
     Pilot(10, k=1.0, step=2),
     Pilot(10, k=2.0, step=2, with_position=True),
     Pilot(18, k=1.5, step=2, with_position=True),
+    Pilot(4, k=1.0, by_color=True),
 )
 # Larger windows leave fewer blotches on smooth walls and in fog.
 FINAL_PILOTS = (
@@ -287,18 +293,45 @@ def following_guides(
     return guides, (first_a, first_b), (filled_a, filled_b)
 
 
-def pilot_images(
-    pilot: Pilot, colors: tuple[FloatImage, ...], guides: Guides, guidance: tuple[Guidance, ...]
-) -> tuple[FloatImage, ...]:
-    """Denoise every half by one pilot; return linear radiance, shape (height, width, 3), never negative."""
-    if pilot.along_edges:
+@dataclass
+class PilotMaker:
+    """Makes the pilots of both halves, or of the mean alone; ``variance`` as `first_guides` takes it."""
+
+    colors: tuple[FloatImage, ...]
+    variance: FloatImage | None
+    guidance: tuple[Guidance, ...]
+    guides: Guides
+
+    def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
+        """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
+        if pilot.along_edges:
+            return tuple(
+                _along_edges(color, pilot.radius, g.features, g.penalty, g.threads)
+                for color, g in zip(self.colors, self.guidance, strict=True)
+            )
+        guidance, guides = self._by_color if pilot.by_color else (self.guidance, self.guides)
         return tuple(
-            _along_edges(color, pilot.radius, g.features, g.penalty, g.threads)
-            for color, g in zip(colors, guidance, strict=True)
+            g.color(_regress(image, pilot, g, guide, guides.noise))
+            for image, guide, g in zip(guides.irradiances, guides.images, guidance, strict=True)
         )
-    return tuple(
-        g.color(_regress(image, pilot, g, guide, guides.noise))
-        for image, guide, g in zip(guides.irradiances, guides.images, guidance, strict=True)
+
+    @cached_property
+    def _by_color(self) -> tuple[tuple[Guidance, ...], Guides]:
+        guidance = tuple(_without_features(g) for g in self.guidance)
+        return guidance, first_guides(self.colors, self.variance, guidance)
+
+
+def _without_features(guidance: Guidance) -> Guidance:
+    height, width = guidance.features.shape[:2]
+    nothing = np.zeros_like(guidance.emission)
+    return replace(
+        guidance,
+        features=np.empty((height, width, 0), np.float32),
+        names=(),
+        penalty=(),
+        albedo=np.ones_like(guidance.albedo),
+        emission=nothing,
+        smooth_emission=nothing,
     )
 
 

@@ -33,7 +33,7 @@ LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
 """All but the weights: bounds what a parser makes of them."""
 
-_FORMAT = 1
+_FORMAT = 2
 """Raised whenever another graph is written."""
 
 _PROPERTY = "tungsten_dip"
