@@ -5,6 +5,7 @@
 // patch.
 #include <algorithm>
 #include <array>
+#include <cstdint>
 #include <vector>
 
 #include "core.hpp"
@@ -24,7 +25,10 @@ constexpr float epsilon = 1e-7F;
 // From here on a weight is 0 whatever the rest of the patch says; keeps the sums far from overflow.
 constexpr float largest_distance = 1e4F;
 
-constexpr int tile_size = 64;
+// The standard deviation, relative to the feature, from which on a pixel has noise worth filtering.
+constexpr float least_noise = 1e-3F;
+
+constexpr int tile_size = 48;
 constexpr int padded_size = tile_size + 2 * patch_radius;
 
 // An image's channels one after the other: [channel][y][x].
@@ -59,14 +63,17 @@ struct Feature {
     Planes b;
     Planes variance;  // of one half
 
-    // A few samples can agree by chance on one side of an edge: a pixel next to a noisy one is noisy, too.
-    [[nodiscard]] bool noisy(int c, int y, int x) const {
-        for (int v = std::max(y - 1, 0); v <= std::min(y + 1, a.height - 1); ++v) {
-            for (int u = std::max(x - 1, 0); u <= std::min(x + 1, a.width - 1); ++u) {
-                if (variance.row(c, v)[u] > 0 || a.row(c, v)[u] != b.row(c, v)[u]) return true;
-            }
+    [[nodiscard]] bool noisy(int y, int x) const {
+        float squared = 0;
+        float noise = 0;
+        for (int c = 0; c < a.channels; ++c) {
+            const float value_a = a.row(c, y)[x];
+            const float value_b = b.row(c, y)[x];
+            const float difference = value_a - value_b;
+            squared += value_a * value_a + value_b * value_b;
+            noise += variance.row(c, y)[x] + difference * difference;
         }
-        return false;
+        return noise > least_noise * least_noise * squared;
     }
 };
 
@@ -92,15 +99,68 @@ struct HalvesRow {
     std::array<float, size> b{};
 };
 
-// Filters one tile of a feature. Rows and columns of the scratch memory are relative to the tile or, where
-// they are padded, to the tile grown by a patch's radius.
+struct Rectangle {
+    Range rows;
+    Range columns;
+
+    [[nodiscard]] bool empty() const { return rows.begin >= rows.end || columns.begin >= columns.end; }
+};
+
+// Which pixels are noisy, or next to one that is: a few samples can agree by chance on one side of an edge.
+class NoisyPixels {
+  public:
+    NoisyPixels(const Feature& feature, int threads)
+        : height_(feature.a.height),
+          width_(feature.a.width),
+          own_(static_cast<std::size_t>(height_) * static_cast<std::size_t>(width_)) {
+        parallel_for(height_, threads, [&](int y) {
+            for (int x = 0; x < width_; ++x) own_[index(y, x)] = feature.noisy(y, x) ? 1 : 0;
+        });
+    }
+
+    [[nodiscard]] bool at(int y, int x) const {
+        for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); ++v) {
+            for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); ++u) {
+                if (own_[index(v, u)] != 0) return true;
+            }
+        }
+        return false;
+    }
+
+    // The part of a tile that holds them all.
+    [[nodiscard]] Rectangle within(Rectangle tile) const {
+        Rectangle part{.rows = {.begin = tile.rows.end, .end = tile.rows.begin},
+                       .columns = {.begin = tile.columns.end, .end = tile.columns.begin}};
+        for (int y = tile.rows.begin; y < tile.rows.end; ++y) {
+            for (int x = tile.columns.begin; x < tile.columns.end; ++x) {
+                if (!at(y, x)) continue;
+                part.rows = {.begin = std::min(part.rows.begin, y), .end = y + 1};
+                part.columns = {.begin = std::min(part.columns.begin, x),
+                                .end = std::max(part.columns.end, x + 1)};
+            }
+        }
+        return part;
+    }
+
+  private:
+    int height_;
+    int width_;
+    std::vector<std::uint8_t> own_;
+
+    [[nodiscard]] std::size_t index(int y, int x) const {
+        return static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x);
+    }
+};
+
+// Filters one tile of a feature, or a part of it. Rows and columns of the scratch memory are relative to the
+// tile or, where they are padded, to the tile grown by a patch's radius.
 class TileFilter {
   public:
-    TileFilter(const Feature& feature, SearchWindow window, int top, int left)
+    TileFilter(const Feature& feature, SearchWindow window, Rectangle tile)
         : feature_(feature),
           k_squared_(window.k * window.k),
-          rows_{.begin = top, .end = std::min(top + tile_size, feature.a.height)},
-          columns_{.begin = left, .end = std::min(left + tile_size, feature.a.width)},
+          rows_(tile.rows),
+          columns_(tile.columns),
           sums_(static_cast<std::size_t>(feature.a.channels * tile_size)),
           weights_(tile_size),
           patch_rows_(padded_size) {
@@ -109,16 +169,16 @@ class TileFilter {
         }
     }
 
-    void write(Image half_a, Image half_b) const {
+    void write(const NoisyPixels& noisy, Image half_a, Image half_b) const {
         for (int y = rows_.begin; y < rows_.end; ++y) {
             const auto& weight = weights_[tile_row(y)];
             for (int c = 0; c < feature_.a.channels; ++c) {
                 const auto& sum = sums_[sum_row(c, y)];
                 for (int x = columns_.begin; x < columns_.end; ++x) {
                     const auto i = static_cast<std::size_t>(x - columns_.begin);
-                    const bool noisy = feature_.noisy(c, y, x);
-                    half_a.at(y, x, c) = feature_.a.row(c, y)[x] + (noisy ? sum.a[i] / weight.a[i] : 0);
-                    half_b.at(y, x, c) = feature_.b.row(c, y)[x] + (noisy ? sum.b[i] / weight.b[i] : 0);
+                    if (!noisy.at(y, x)) continue;
+                    half_a.at(y, x, c) = feature_.a.row(c, y)[x] + sum.a[i] / weight.a[i];
+                    half_b.at(y, x, c) = feature_.b.row(c, y)[x] + sum.b[i] / weight.b[i];
                 }
             }
         }
@@ -235,17 +295,6 @@ class TileFilter {
     }
 };
 
-bool any_noise(const Feature& feature, int top, int left) {
-    for (int c = 0; c < feature.a.channels; ++c) {
-        for (int y = top; y < std::min(top + tile_size, feature.a.height); ++y) {
-            for (int x = left; x < std::min(left + tile_size, feature.a.width); ++x) {
-                if (feature.noisy(c, y, x)) return true;
-            }
-        }
-    }
-    return false;
-}
-
 // The variance of one half: twice that of the mean, which the halves tell roughly where it is not known.
 void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
     ConstImage of_mean = in.variance;
@@ -266,6 +315,7 @@ void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window,
     estimate_variance_of_half(in, out.variance, threads);
     const Feature feature{
         .a = {in.half_a, threads}, .b = {in.half_b, threads}, .variance = {out.variance, threads}};
+    const NoisyPixels noisy(feature, threads);
     std::copy_n(in.half_a.data, in.half_a.size(), out.half_a.data);
     std::copy_n(in.half_b.data, in.half_b.size(), out.half_b.data);
 
@@ -274,8 +324,10 @@ void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window,
     parallel_for(tile_rows * tile_columns, threads, [&](int tile) {
         const int top = tile / tile_columns * tile_size;
         const int left = tile % tile_columns * tile_size;
-        if (any_noise(feature, top, left))
-            TileFilter(feature, window, top, left).write(out.half_a, out.half_b);
+        const Rectangle part =
+            noisy.within({.rows = {.begin = top, .end = std::min(top + tile_size, in.mean.height)},
+                          .columns = {.begin = left, .end = std::min(left + tile_size, in.mean.width)}});
+        if (!part.empty()) TileFilter(feature, window, part).write(noisy, out.half_a, out.half_b);
     });
 
     halves_variance(out.half_a, out.half_b, out.mean, threads);

@@ -389,7 +389,7 @@ def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: Syn
     """What a half's features share with the colour that scores it would pass for truth."""
 
     def darkened(half: str) -> RenderBuffers:
-        # Albedos lower in one half by less than their noise: the pre-filter's weights hardly change, values do.
+        # Albedos lower in one half by less than their noise: the pre-filter's weights hardly change.
         albedo = render.buffers.albedo
         assert albedo is not None
         image = getattr(albedo, half)

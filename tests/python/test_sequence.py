@@ -109,6 +109,21 @@ def test_what_is_moved_is_what_the_camera_sees(tmp_path):
     np.testing.assert_array_equal(np.isnan(moved_a), np.isnan(moved_b))
 
 
+def test_what_is_moved_to_a_half_takes_nothing_of_the_albedo_from_the_other(tmp_path):
+    """What it shared with the half that scores it would pass for truth."""
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.1))
+    albedo = now.buffers.albedo.mean
+    truth = before.reference, before.reference
+
+    def moved(half_b):
+        buffers = now.buffers.with_quantities(albedo=Buffer(albedo, albedo, half_b))
+        return reproject(truth, before.buffers, before.camera, buffers, now.camera)
+
+    (a, b), (a_now, b_now) = moved(albedo), moved(albedo * np.float32(1.25))
+    np.testing.assert_array_equal(a, a_now)
+    assert np.nanmax(np.abs(b - b_now)) > 0.02
+
+
 def test_a_camera_that_stands_still_moves_nothing(tmp_path):
     frame = true_frame(tmp_path, 0.1, seed=0)
     moved, _ = reproject(

@@ -99,7 +99,13 @@ FINAL_PILOTS = (
     Pilot(32, k=2.0, step=4, with_position=True),
 )
 
-FOLLOWING_PILOTS = (Pilot(1), EDGES, Pilot(4, k=1.0), Pilot(6, k=2.0, step=2))
+FOLLOWING_PILOTS = (
+    Pilot(1),
+    EDGES,
+    Pilot(4, k=1.0),
+    Pilot(6, k=2.0, step=2),
+    Pilot(4, k=1.0, by_color=True),
+)
 """Enough beside what the previous frame shows. The first stands where that shows nothing."""
 
 

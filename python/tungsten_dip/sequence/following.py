@@ -16,6 +16,7 @@ import numpy as np
 
 from tungsten_dip import fit
 from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model
@@ -31,7 +32,7 @@ _LOG = logging.getLogger(__name__)
 Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
-_FIRST_FOLLOWING_STEPS = 60
+_FIRST_FOLLOWING_STEPS = 120
 """Of the network for frames that follow: it has few pilots, and its task is close to the next frame's."""
 
 _MOST_STEPS = 240
@@ -61,9 +62,10 @@ class Followed:
 
 @dataclass(frozen=True)
 class _Last:
-    """What is kept of a frame for the next one."""
+    """What is kept of a frame for the next one. ``smooth`` is the buffers with an albedo of little noise."""
 
     buffers: RenderBuffers
+    smooth: RenderBuffers
     camera: Camera | None
     result: FitResult
 
@@ -96,9 +98,10 @@ class Follower:
         buffers, mended = sanitize(buffers, self._settings.threads)
         for note in mended:
             _LOG.info(note)
+        smooth = self._with_smooth_albedo(buffers) if camera is not None else buffers
         how: How = "fitted"
         try:
-            followed = self._follow(buffers, camera, progress)
+            followed = self._follow(buffers, smooth, camera, progress)
         except _CutError as cut:
             _LOG.info("a cut: %s", cut)
             how, followed = "cut", None
@@ -107,10 +110,16 @@ class Follower:
             self.models = replace(self.models, first=followed.result.model)
         result = followed.result
         self._error = _typical_error(result)
-        self._last = _Last(buffers, camera, result)
+        self._last = _Last(buffers, smooth, camera, result)
         return replace(followed, result=replace(result, notes=(*mended, *result.notes)))
 
-    def _follow(self, buffers: RenderBuffers, camera: Camera | None, progress: Progress) -> Followed | None:
+    def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
+        alone = buffers.with_quantities(normal=None, depth=None, visibility=None)
+        return buffers.with_quantities(albedo=prefilter_features(alone, self._settings.threads).albedo)
+
+    def _follow(
+        self, buffers: RenderBuffers, smooth: RenderBuffers, camera: Camera | None, progress: Progress
+    ) -> Followed | None:
         """Return what follows from the networks and the last frame, None if there is neither.
 
         Raises _CutError if the frame shows something else.
@@ -118,7 +127,7 @@ class Follower:
         last = self._last
         if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
             raise _CutError("the previous frame had another size")
-        moved = None if last is None else _moved(last, buffers, camera)
+        moved = None if last is None else _moved(last, smooth, camera)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
         model = self.models.first if moved is None else self.models.following
@@ -155,7 +164,7 @@ def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None) -> Halves
         return None
     if buffers.depth is None or last.buffers.depth is None:
         return None
-    return reproject(last.result.halves, last.buffers, last.camera, buffers, camera)
+    return reproject(last.result.halves, last.smooth, last.camera, buffers, camera)
 
 
 def _typical_error(result: FitResult) -> float | None:

@@ -61,16 +61,18 @@ def reproject(
 ) -> Halves:
     """Move the previous frame's halves (linear radiance, shape (height, width, 3)) to the current frame.
 
-    Both buffers are sanitised, have one size and a depth. Where the previous frame does not show what the
-    current one does, the result is NaN.
+    Both buffers are sanitised, have one size and a depth, and albedos with little noise. Where the previous
+    frame does not show what the current one does, the result is NaN.
     """
     assert current.depth is not None
     shape = current.color.mean.shape
     depth = current.depth.mean[:, :, 0]
     column, row, distance = _seen_from(previous_camera, _points(camera, depth), depth > 0)
-    # Light is moved without the albedo, which the current frame knows more sharply.
-    albedo, previous_albedo = _divisor(current), _divisor(previous)
-    images = [(half / previous_albedo).reshape(-1, 3) for half in halves]
+    # Light is moved without the albedo, which the current frame knows more sharply. Of that, each half takes
+    # its own: errors that it shared with the half which scores it would pass for truth.
+    images = [
+        (half / albedo).reshape(-1, 3) for half, albedo in zip(halves, _divisors(previous), strict=True)
+    ]
     moved = [np.zeros((depth.size, 3), np.float32) for _ in halves]
     total = np.zeros(depth.size, np.float32)
     for index, weight in _neighbours(column, row, shape[0], shape[1]):
@@ -79,7 +81,10 @@ def reproject(
         for sums, image in zip(moved, images, strict=True):
             sums += weight[:, None] * image[index]
     total[total < _LEAST_WEIGHT] = np.nan
-    moved_a, moved_b = ((sums / total[:, None]).reshape(shape) * albedo for sums in moved)
+    moved_a, moved_b = (
+        (sums / total[:, None]).reshape(shape) * albedo
+        for sums, albedo in zip(moved, _divisors(current), strict=True)
+    )
     return moved_a, moved_b
 
 
@@ -155,12 +160,17 @@ def _largest(values: Array) -> Array:
     return largest
 
 
-def _divisor(buffers: RenderBuffers) -> FloatImage | np.float32:
-    if buffers.albedo is None:
-        return np.float32(1)
-    albedo = buffers.albedo.mean
-    black = channel_mean(albedo) < _BLACK_ALBEDO
-    return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
+def _divisors(buffers: RenderBuffers) -> tuple[FloatImage | np.float32, ...]:
+    """Return what divides the colour of each half."""
+    albedo = buffers.albedo
+    if albedo is None:
+        return np.float32(1), np.float32(1)
+    a = albedo.mean if albedo.half_a is None else albedo.half_a
+    b = albedo.mean if albedo.half_b is None else albedo.half_b
+    return tuple(
+        np.where(channel_mean(image) < _BLACK_ALBEDO, np.float32(1), image + np.float32(_LEAST_ALBEDO))
+        for image in (a, b)
+    )
 
 
 def _rotation(camera: Camera) -> npt.NDArray[np.float64]:
