@@ -15,6 +15,7 @@ from pathlib import Path
 from unittest import mock
 
 from tungsten_dip.bench.sets import read_sets
+from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
 from tungsten_dip.report.metrics import compare
@@ -45,6 +46,8 @@ VARIANTS: dict[str, Change] = {
     "guided pilots alone": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
     "no regression on the position": _without(lambda pilot: pilot.with_position),
     "no mean along edges as a pilot": _without(lambda pilot: pilot.along_edges),
+    "no pilot that sees the colour alone": _without(lambda pilot: pilot.by_color),
+    "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         pilots, "_along_edges", lambda image, *_: image
     ),
