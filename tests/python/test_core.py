@@ -214,6 +214,20 @@ def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRe
     assert np.mean((filtered.albedo.mean - reference) ** 2) < 0.6 * noise
 
 
+def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:
+    """As in glass, where a sample is reflected or goes through: a single pass keeps a part of the speckle."""
+    rng = np.random.default_rng(0)
+    samples = (rng.uniform(size=(4, 64, 48, 3)) < 0.5).astype(np.float32)
+    half_a, half_b = samples[::2].mean(axis=0), samples[1::2].mean(axis=0)
+    albedo = Buffer((half_a + half_b) / 2, half_a, half_b, samples.var(axis=0, ddof=1) / 4)
+    filtered = prefilter_features(RenderBuffers(albedo, albedo=albedo)).albedo
+    assert filtered is not None
+    one_pass = _core.prefilter_feature(albedo.mean, half_a, half_b, albedo.variance)[0]
+    error, error_of_one = (float(np.mean((image - 0.5) ** 2)) for image in (filtered.mean, one_pass))
+    assert error < 0.5 * error_of_one
+    assert error_of_one < 0.1 * float(np.mean((albedo.mean - 0.5) ** 2))
+
+
 def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     buffers = make_render(height=71, width=133).buffers
     one, many = prefilter_features(buffers, threads=1), prefilter_features(buffers, threads=5)

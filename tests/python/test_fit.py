@@ -12,7 +12,15 @@ from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, Guidance, guidance_of_halves
+from tungsten_dip.fit.pilots import (
+    BALANCED_PILOTS,
+    DRAFT_PILOTS,
+    Guidance,
+    Pilot,
+    PilotMaker,
+    first_guides,
+    guidance_of_halves,
+)
 
 pytest.importorskip("torch")
 
@@ -399,6 +407,32 @@ def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: Syn
     plain, changed = _guidance(render.buffers), _guidance(darkened("half_b"))
     assert np.abs(changed[1].albedo / plain[1].albedo - 1).mean() > 0.015
     assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.0025
+
+
+def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None:
+    """In mirrors and glass features are noise: what one pilot makes of the colour must not show it."""
+    rng = np.random.default_rng(0)
+
+    def noise(feature: Buffer | None) -> Buffer:
+        assert feature is not None
+        return Buffer(*(rng.uniform(0, 1, feature.mean.shape).astype(np.float32) for _ in range(3)))
+
+    def images(buffers: RenderBuffers, pilot: Pilot) -> tuple[FloatImage, ...]:
+        color = buffers.color
+        assert color.half_a is not None
+        assert color.half_b is not None
+        halves, guidance = (color.half_a, color.half_b), _guidance(buffers)
+        guides = first_guides(halves, None, guidance)
+        return PilotMaker(halves, None, guidance, guides).images(pilot)
+
+    features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
+    noisy = render.buffers.with_quantities(**features)
+    by_color, by_features = Pilot(4, k=1.0, by_color=True), Pilot(4, k=1.0)
+    alone = images(render.buffers.with_quantities(**dict.fromkeys(features)), by_color)
+    np.testing.assert_array_equal(images(noisy, by_color), images(render.buffers, by_color))
+    np.testing.assert_array_equal(images(noisy, by_color), alone)
+    errors = [_rel_mse(images(noisy, pilot)[0], render.reference) for pilot in (by_color, by_features)]
+    assert errors[0] < 0.8 * errors[1]
 
 
 def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
