@@ -11,6 +11,7 @@
 #include "core.hpp"
 #include "exp_minus.hpp"
 #include "fastest.hpp"
+#include "padded_planes.hpp"
 
 namespace tungsten_dip {
 namespace {
@@ -29,44 +30,21 @@ constexpr float largest_distance = 1e4F;
 constexpr float least_noise = 1e-3F;
 
 constexpr int tile_size = 48;
-constexpr int padded_size = tile_size + 2 * patch_radius;
 
-// An image's channels one after the other: [channel][y][x].
-struct Planes {
-    int height;
-    int width;
-    int channels;
-    std::vector<float> pixels;
-
-    Planes(ConstImage image, int threads)
-        : height(image.height),
-          width(image.width),
-          channels(image.channels),
-          pixels(static_cast<std::size_t>(image.size())) {
-        parallel_for(height, threads, [&](int y) {
-            for (int c = 0; c < channels; ++c) {
-                float* to = pixels.data() + offset(c, y);
-                for (int x = 0; x < width; ++x) to[x] = image.at(y, x, c);
-            }
-        });
-    }
-    [[nodiscard]] const float* row(int c, int y) const { return pixels.data() + offset(c, y); }
-
-  private:
-    [[nodiscard]] std::ptrdiff_t offset(int c, int y) const {
-        return (static_cast<std::ptrdiff_t>(c) * height + y) * width;
-    }
-};
+// Pixels that are computed together: rows are as many as they need to be full.
+constexpr int lanes = 8;
+constexpr int rounded_up(int count) { return (count + lanes - 1) / lanes * lanes; }
+constexpr int padded_size = rounded_up(tile_size + 2 * patch_radius);
 
 struct Feature {
-    Planes a;
-    Planes b;
-    Planes variance;  // of one half
+    PaddedPlanes a;
+    PaddedPlanes b;
+    PaddedPlanes variance;  // of one half
 
     [[nodiscard]] bool noisy(int y, int x) const {
         float squared = 0;
         float noise = 0;
-        for (int c = 0; c < a.channels; ++c) {
+        for (int c = 0; c < a.channels(); ++c) {
             const float value_a = a.row(c, y)[x];
             const float value_b = b.row(c, y)[x];
             const float difference = value_a - value_b;
@@ -81,22 +59,14 @@ struct Range {
     int begin;
     int end;  // one past the last
 
-    [[nodiscard]] Range clipped(Range to) const {
-        return {.begin = std::max(begin, to.begin), .end = std::min(end, to.end)};
-    }
-    [[nodiscard]] Range grown(int by) const { return {.begin = begin - by, .end = end + by}; }
+    [[nodiscard]] int size() const { return end - begin; }
 };
 
-// The pixels of an axis that have a partner at the offset within the image.
-Range paired(int size, int offset) {
-    return {.begin = std::max(0, -offset), .end = std::min(size, size - offset)};
-}
-
-// The same quantity of both halves.
+// A row of the same quantity of both halves.
 template <int size>
 struct HalvesRow {
-    std::array<float, size> a{};
-    std::array<float, size> b{};
+    std::array<float, size> a;
+    std::array<float, size> b;
 };
 
 struct Rectangle {
@@ -110,42 +80,44 @@ struct Rectangle {
 class NoisyPixels {
   public:
     NoisyPixels(const Feature& feature, int threads)
-        : height_(feature.a.height),
-          width_(feature.a.width),
-          own_(static_cast<std::size_t>(height_) * static_cast<std::size_t>(width_)) {
+        : height_(feature.a.height()),
+          width_(feature.a.width()),
+          noisy_(static_cast<std::size_t>(height_) * static_cast<std::size_t>(width_)) {
+        std::vector<std::uint8_t> alone(noisy_.size());
         parallel_for(height_, threads, [&](int y) {
-            for (int x = 0; x < width_; ++x) own_[index(y, x)] = feature.noisy(y, x) ? 1 : 0;
+            for (int x = 0; x < width_; ++x) alone[index(y, x)] = feature.noisy(y, x) ? 1 : 0;
+        });
+        parallel_for(height_, threads, [&](int y) {
+            for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); ++v) {
+                for (int x = 0; x < width_; ++x) {
+                    for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); ++u)
+                        noisy_[index(y, x)] |= alone[index(v, u)];
+                }
+            }
         });
     }
 
-    [[nodiscard]] bool at(int y, int x) const {
-        for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); ++v) {
-            for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); ++u) {
-                if (own_[index(v, u)] != 0) return true;
-            }
-        }
-        return false;
-    }
+    [[nodiscard]] bool at(int y, int x) const { return noisy_[index(y, x)] != 0; }
 
     // The part of a tile that holds them all.
     [[nodiscard]] Rectangle within(Rectangle tile) const {
-        Rectangle part{.rows = {.begin = tile.rows.end, .end = tile.rows.begin},
-                       .columns = {.begin = tile.columns.end, .end = tile.columns.begin}};
+        Rectangle bounds{.rows = {.begin = tile.rows.end, .end = tile.rows.begin},
+                         .columns = {.begin = tile.columns.end, .end = tile.columns.begin}};
         for (int y = tile.rows.begin; y < tile.rows.end; ++y) {
             for (int x = tile.columns.begin; x < tile.columns.end; ++x) {
                 if (!at(y, x)) continue;
-                part.rows = {.begin = std::min(part.rows.begin, y), .end = y + 1};
-                part.columns = {.begin = std::min(part.columns.begin, x),
-                                .end = std::max(part.columns.end, x + 1)};
+                bounds.rows = {.begin = std::min(bounds.rows.begin, y), .end = y + 1};
+                bounds.columns = {.begin = std::min(bounds.columns.begin, x),
+                                  .end = std::max(bounds.columns.end, x + 1)};
             }
         }
-        return part;
+        return bounds;
     }
 
   private:
     int height_;
     int width_;
-    std::vector<std::uint8_t> own_;
+    std::vector<std::uint8_t> noisy_;
 
     [[nodiscard]] std::size_t index(int y, int x) const {
         return static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x);
@@ -153,7 +125,8 @@ class NoisyPixels {
 };
 
 // Filters one tile of a feature, or a part of it. Rows and columns of the scratch memory are relative to the
-// tile or, where they are padded, to the tile grown by a patch's radius.
+// tile or, where they are padded, to the tile grown by a patch's radius. Patches see the image's border
+// repeated outwards.
 class TileFilter {
   public:
     TileFilter(const Feature& feature, SearchWindow window, Rectangle tile)
@@ -161,7 +134,7 @@ class TileFilter {
           k_squared_(window.k * window.k),
           rows_(tile.rows),
           columns_(tile.columns),
-          sums_(static_cast<std::size_t>(feature.a.channels * tile_size)),
+          sums_(static_cast<std::size_t>(feature.a.channels() * tile_size)),
           weights_(tile_size),
           patch_rows_(padded_size) {
         for (int dy = -window.radius; dy <= window.radius; ++dy) {
@@ -172,7 +145,7 @@ class TileFilter {
     void write(const NoisyPixels& noisy, Image half_a, Image half_b) const {
         for (int y = rows_.begin; y < rows_.end; ++y) {
             const auto& weight = weights_[tile_row(y)];
-            for (int c = 0; c < feature_.a.channels; ++c) {
+            for (int c = 0; c < feature_.a.channels(); ++c) {
                 const auto& sum = sums_[sum_row(c, y)];
                 for (int x = columns_.begin; x < columns_.end; ++x) {
                     const auto i = static_cast<std::size_t>(x - columns_.begin);
@@ -193,103 +166,103 @@ class TileFilter {
     std::vector<HalvesRow<tile_size>> weights_;     // [row] sum of the weights, half a's from b's patches
     std::vector<HalvesRow<tile_size>> patch_rows_;  // [padded row] distances summed over a patch's columns
 
+    [[nodiscard]] int count() const { return rounded_up(columns_.size()); }
     [[nodiscard]] std::size_t tile_row(int y) const { return static_cast<std::size_t>(y - rows_.begin); }
-    [[nodiscard]] std::size_t padded_row(int y) const { return tile_row(y) + patch_radius; }
     [[nodiscard]] std::size_t sum_row(int c, int y) const {
         return static_cast<std::size_t>(c) * tile_size + tile_row(y);
     }
 
     void add_offset(int dy, int dx) {
-        const Range valid_rows = paired(feature_.a.height, dy);
-        const Range valid_columns = paired(feature_.a.width, dx);
-        const Range rows = rows_.clipped(valid_rows);
-        const Range columns = columns_.clipped(valid_columns);
-        if (rows.begin >= rows.end || columns.begin >= columns.end) return;
-
-        // Patches are clipped where they or their partners leave the image: the distance is a mean over the
-        // rest.
-        std::array<float, tile_size> patch_width{};
-        for (int x = columns.begin; x < columns.end; ++x) {
-            const Range patch = Range{.begin = x, .end = x + 1}.grown(patch_radius).clipped(valid_columns);
-            patch_width[static_cast<std::size_t>(x - columns_.begin)] =
-                static_cast<float>(patch.end - patch.begin);
-        }
-        const Range padded_rows = rows_.grown(patch_radius).clipped(valid_rows);
-        const Range padded_columns = columns_.grown(patch_radius).clipped(valid_columns);
-        for (int y = padded_rows.begin; y < padded_rows.end; ++y) {
-            measure_row(y, dy, dx, padded_columns, patch_rows_[padded_row(y)]);
-        }
-        for (int y = rows.begin; y < rows.end; ++y) {
-            add_row(y, dy, dx, columns,
-                    Range{.begin = y, .end = y + 1}.grown(patch_radius).clipped(valid_rows), patch_width);
-        }
+        const int height = feature_.a.height();
+        const int first = std::max(rows_.begin, -dy);
+        const int end = std::min(rows_.end, height - dy);
+        if (first >= end) return;
+        for (int y = first - patch_radius; y < end + patch_radius; ++y)
+            measure_row(y, dy, dx, patch_rows_[tile_row(y + patch_radius)]);
+        for (int y = first; y < end; ++y) add_row(y, dy, dx);
     }
 
     // The distances of a row's pixels to their partners, after Rousselle et al. 2012: squared differences
     // less what noise alone makes of them, over the variance, averaged over channels, then summed over the
     // columns of patches.
-    TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, Range columns,
-                                          HalvesRow<tile_size>& out) const {
-        HalvesRow<padded_size> distances;
-        const int first = columns.begin;
-        const auto begin = static_cast<std::size_t>(columns.begin - columns_.begin) + patch_radius;
-        const auto end = static_cast<std::size_t>(columns.end - columns_.begin) + patch_radius;
-        const float share = 1.0F / static_cast<float>(feature_.a.channels);
-        for (int c = 0; c < feature_.a.channels; ++c) {
-            const float* a = feature_.a.row(c, y) + first;
-            const float* b = feature_.b.row(c, y) + first;
-            const float* variance = feature_.variance.row(c, y) + first;
-            const float* a_there = feature_.a.row(c, y + dy) + first + dx;
-            const float* b_there = feature_.b.row(c, y + dy) + first + dx;
-            const float* variance_there = feature_.variance.row(c, y + dy) + first + dx;
-            for (std::size_t i = begin; i < end; ++i) {
-                const std::size_t j = i - begin;
-                const float noise = variance[j] + std::min(variance[j], variance_there[j]);
-                const float scale = share / (k_squared_ * (variance[j] + variance_there[j]) + epsilon);
-                const float difference_a = a[j] - a_there[j];
-                const float difference_b = b[j] - b_there[j];
-                distances.a[i] += std::min((difference_a * difference_a - noise) * scale, largest_distance);
-                distances.b[i] += std::min((difference_b * difference_b - noise) * scale, largest_distance);
+    TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, HalvesRow<tile_size>& out) const {
+        HalvesRow<padded_size> distances;  // NOLINT(*-member-init): the first channel sets them
+        const int padded_count = rounded_up(columns_.size() + 2 * patch_radius);
+        const int x = columns_.begin - patch_radius;
+        const float share = 1.0F / static_cast<float>(feature_.a.channels());
+        for (int c = 0; c < feature_.a.channels(); ++c) {
+            const float* a = feature_.a.row(c, y) + x;
+            const float* b = feature_.b.row(c, y) + x;
+            const float* variance = feature_.variance.row(c, y) + x;
+            const float* a_there = feature_.a.row(c, y + dy) + x + dx;
+            const float* b_there = feature_.b.row(c, y + dy) + x + dx;
+            const float* variance_there = feature_.variance.row(c, y + dy) + x + dx;
+            for (std::size_t i = 0; i < static_cast<std::size_t>(padded_count); ++i) {
+                const float noise = variance[i] + std::min(variance[i], variance_there[i]);
+                const float scale = share / (k_squared_ * (variance[i] + variance_there[i]) + epsilon);
+                const float difference_a = a[i] - a_there[i];
+                const float difference_b = b[i] - b_there[i];
+                const float sum_a = c == 0 ? 0 : distances.a[i];
+                const float sum_b = c == 0 ? 0 : distances.b[i];
+                distances.a[i] =
+                    sum_a + std::min((difference_a * difference_a - noise) * scale, largest_distance);
+                distances.b[i] =
+                    sum_b + std::min((difference_b * difference_b - noise) * scale, largest_distance);
             }
         }
-        out = {};
-        for (std::size_t tap = 0; tap < patch_size; ++tap) {
-            for (std::size_t i = 0; i < tile_size; ++i) out.a[i] += distances.a[i + tap];
-            for (std::size_t i = 0; i < tile_size; ++i) out.b[i] += distances.b[i + tap];
+        for (std::size_t i = 0; i < static_cast<std::size_t>(count()); ++i) {
+            float sum_a = 0;
+            float sum_b = 0;
+            for (std::size_t tap = 0; tap < patch_size; ++tap) {
+                sum_a += distances.a[i + tap];
+                sum_b += distances.b[i + tap];
+            }
+            out.a[i] = sum_a;
+            out.b[i] = sum_b;
         }
     }
 
-    TUNGSTEN_DIP_FASTEST void add_row(int y, int dy, int dx, Range columns, Range patch,
-                                      const std::array<float, tile_size>& patch_width) {
-        HalvesRow<tile_size> weight;
-        for (int row = patch.begin; row < patch.end; ++row) {
-            const auto& distance = patch_rows_[padded_row(row)];
-            for (std::size_t i = 0; i < tile_size; ++i) weight.a[i] += distance.b[i];
-            for (std::size_t i = 0; i < tile_size; ++i) weight.b[i] += distance.a[i];
+    TUNGSTEN_DIP_FASTEST void add_row(int y, int dy, int dx) {
+        // Each half has the weights of the other.
+        HalvesRow<tile_size> weight;  // NOLINT(*-member-init): filled below
+        const HalvesRow<tile_size>* patches = &patch_rows_[tile_row(y)];
+        const auto size = static_cast<std::size_t>(count());
+        constexpr float scale = 1.0F / (patch_size * patch_size);
+        for (std::size_t i = 0; i < size; ++i) {
+            float sum_a = 0;
+            float sum_b = 0;
+            for (std::size_t tap = 0; tap < patch_size; ++tap) {
+                sum_a += patches[tap].b[i];
+                sum_b += patches[tap].a[i];
+            }
+            weight.a[i] = exp_minus(std::max(scale * sum_a, 0.0F));
+            weight.b[i] = exp_minus(std::max(scale * sum_b, 0.0F));
         }
-        const int first = columns.begin;
-        const auto begin = static_cast<std::size_t>(columns.begin - columns_.begin);
-        const auto end = static_cast<std::size_t>(columns.end - columns_.begin);
-        const auto patch_height = static_cast<float>(patch.end - patch.begin);
+        // Partners outside of the image do not count.
+        const int width = feature_.a.width();
+        const int before = std::clamp(-dx - columns_.begin, 0, columns_.size());
+        const int inside = std::clamp(width - dx - columns_.begin, before, columns_.size());
+        for (float* weights : {weight.a.data(), weight.b.data()}) {
+            std::fill_n(weights, before, 0.0F);
+            std::fill(weights + inside, weights + size, 0.0F);
+        }
+
         auto& total = weights_[tile_row(y)];
-        for (std::size_t i = begin; i < end; ++i) {
-            const float values = patch_height * patch_width[i];
-            weight.a[i] = exp_minus(std::max(weight.a[i] / values, 0.0F));
-            weight.b[i] = exp_minus(std::max(weight.b[i] / values, 0.0F));
+        for (std::size_t i = 0; i < size; ++i) {
             total.a[i] += weight.a[i];
             total.b[i] += weight.b[i];
         }
-        for (int c = 0; c < feature_.a.channels; ++c) {
+        const int x = columns_.begin;
+        for (int c = 0; c < feature_.a.channels(); ++c) {
             auto& sum = sums_[sum_row(c, y)];
-            const float* a = feature_.a.row(c, y) + first;
-            const float* b = feature_.b.row(c, y) + first;
-            const float* a_there = feature_.a.row(c, y + dy) + first + dx;
-            const float* b_there = feature_.b.row(c, y + dy) + first + dx;
-            for (std::size_t i = begin; i < end; ++i) {
-                const std::size_t j = i - begin;
+            const float* a = feature_.a.row(c, y) + x;
+            const float* b = feature_.b.row(c, y) + x;
+            const float* a_there = feature_.a.row(c, y + dy) + x + dx;
+            const float* b_there = feature_.b.row(c, y + dy) + x + dx;
+            for (std::size_t i = 0; i < size; ++i) {
                 // Differences, not values: what is equal all around comes out unchanged to the bit.
-                sum.a[i] += weight.a[i] * (a_there[j] - a[j]);
-                sum.b[i] += weight.b[i] * (b_there[j] - b[j]);
+                sum.a[i] += weight.a[i] * (a_there[i] - a[i]);
+                sum.b[i] += weight.b[i] * (b_there[i] - b[i]);
             }
         }
     }
@@ -312,9 +285,12 @@ void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
 }  // namespace
 
 void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads) {
+    if (in.mean.size() == 0) return;
     estimate_variance_of_half(in, out.variance, threads);
-    const Feature feature{
-        .a = {in.half_a, threads}, .b = {in.half_b, threads}, .variance = {out.variance, threads}};
+    const int margin = window.radius + patch_radius;
+    const Feature feature{.a = {in.half_a, margin, threads},
+                          .b = {in.half_b, margin, threads},
+                          .variance = {out.variance, margin, threads}};
     const NoisyPixels noisy(feature, threads);
     std::copy_n(in.half_a.data, in.half_a.size(), out.half_a.data);
     std::copy_n(in.half_b.data, in.half_b.size(), out.half_b.data);

@@ -49,27 +49,28 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
     const auto inside = [&](int row, int column) {
         return row >= 0 && row < height && column >= 0 && column < width;
     };
+    const auto repeated = [&](Pixels& image, int row, int column) {
+        return image.at(std::clamp(row, 0, height - 1), std::clamp(column, 0, width - 1));
+    };
     double sum = 0;
     double weights = 0;
     for (int dy = -window.radius; dy <= window.radius; ++dy) {
         for (int dx = -window.radius; dx <= window.radius; ++dx) {
             if (!inside(y + dy, x + dx)) continue;
             double distance = 0;
-            int count = 0;
             for (int py = y - 3; py <= y + 3; ++py) {
                 for (int px = x - 3; px <= x + 3; ++px) {
-                    if (!inside(py, px) || !inside(py + dy, px + dx)) continue;
-                    const double here = 2.0 * render.variance.at(py, px);
-                    const double there = 2.0 * render.variance.at(py + dy, px + dx);
-                    const double difference =
-                        static_cast<double>(render.half_b.at(py, px)) - render.half_b.at(py + dy, px + dx);
+                    // Patches see the border of the image repeated outwards.
+                    const double here = 2.0 * repeated(render.variance, py, px);
+                    const double there = 2.0 * repeated(render.variance, py + dy, px + dx);
+                    const double difference = static_cast<double>(repeated(render.half_b, py, px)) -
+                                              repeated(render.half_b, py + dy, px + dx);
                     distance += std::min((difference * difference - here - std::min(here, there)) /
                                              (window.k * window.k * (here + there) + 1e-7),
                                          1e4);
-                    ++count;
                 }
             }
-            const double weight = std::exp(-std::max(distance / count, 0.0));
+            const double weight = std::exp(-std::max(distance / 49, 0.0));
             sum += weight * render.half_a.at(y + dy, x + dx);
             weights += weight;
         }
