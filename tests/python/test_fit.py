@@ -11,7 +11,8 @@ import pytest
 from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, FitSettings, denoise
+from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion
+from tungsten_dip.fit.evidence import pilots_of_all_samples
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
@@ -82,8 +83,11 @@ def test_mean_radiance_is_kept(make_render: MakeRender) -> None:
     assert result.color.mean() == pytest.approx(render.reference.mean(), rel=0.02)
 
 
-def test_same_seed_and_threads_same_bits(render: SyntheticRender) -> None:
-    first, again, other = (denoise(render.buffers, _settings(seed=seed)).color for seed in (3, 3, 4))
+def test_same_seed_same_bits_whatever_the_threads(render: SyntheticRender) -> None:
+    first, again, other = (
+        denoise(render.buffers, _settings(preset="balanced", seed=seed, threads=threads)).color
+        for seed, threads in ((3, 1), (3, 2), (4, 2))
+    )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
@@ -340,6 +344,26 @@ def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRe
     _check(result, render.buffers)
     assert any(note.startswith(f"interrupted at step {result.iterations}") for note in result.notes)
     assert 1 <= result.iterations < 1000
+
+
+def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
+    render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def until_given_up(*arguments: Any) -> tuple[FloatImage, ...]:
+        *before, given_up = arguments
+        assert given_up.wait(timeout=60)
+        made = pilots_of_all_samples(*before, given_up)
+        assert made == ()
+        return made
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("relMSE"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(fusion, "pilots_of_all_samples", until_given_up)
+    result = denoise(render.buffers, _settings(preset="balanced", threads=2, iterations=100_000), interrupt)
+    _check(result, render.buffers)
+    assert any(note.startswith("interrupted") for note in result.notes)
 
 
 def test_progress_never_falls_and_ends_at_one(render: SyntheticRender) -> None:

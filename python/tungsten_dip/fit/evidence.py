@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from threading import Event
 
 import numpy as np
 import numpy.typing as npt
@@ -86,6 +87,7 @@ _CONFIDENCE = 4.0
 """Standard errors above what the halves tell that an estimated error is believed."""
 
 _CHUNK_PIXELS = 1 << 18
+_PART_PIXELS = 1 << 11
 _SURE = 0.35
 """Relative standard error of an estimated relMSE up to which it is believed."""
 
@@ -308,19 +310,24 @@ def evidence_from_buffers(
 
 
 def pilots_of_all_samples(
-    evidence: Evidence, buffers: RenderBuffers, settings: FitSettings, started: float
+    evidence: Evidence,
+    buffers: RenderBuffers,
+    settings: FitSettings,
+    started: float,
+    threads: int,
+    given_up: Event | None = None,
 ) -> tuple[FloatImage, ...]:
     """Return what the pilots make of all samples, with less noisy features and guides than a half's.
 
     One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
     all for the preset draft, or where the pilots of the halves have used up their share of the time budget,
-    which began at ``started`` (a value of time.perf_counter).
+    which began at ``started`` (a value of time.perf_counter), or once somebody sets ``given_up``.
     """
     late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
     if settings.preset == "draft" or late:
         return ()
     colors = (evidence.mean,)
-    guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.guidance[0].threads)
+    guidance = guidance_of_halves(buffers, colors, evidence.scale, threads)
     a, b = evidence.halves
     variance = np.float32(0.25) * (a - b) ** 2
     guides = first_guides(colors, variance, guidance)
@@ -328,13 +335,15 @@ def pilots_of_all_samples(
     maker = PilotMaker(colors, variance, guidance, guides)
     something = _something(evidence.halves, buffers)
     pilots = evidence.layout.pilots
-    computed = [maker.images(pilot)[0] * something for pilot in pilots]
+    computed = []
+    for pilot in pilots:
+        if given_up is not None and given_up.is_set():
+            return ()
+        computed.append(maker.images(pilot)[0] * something)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
-        image = oidn_image(
-            evidence.mean / np.float32(evidence.scale), albedo, normal, threads=settings.threads
-        )
+        image = oidn_image(evidence.mean / np.float32(evidence.scale), albedo, normal, threads=threads)
         handed_in[-1] = np.maximum(_scaled(image, evidence.scale), 0)
     return (evidence.mean, *computed, *handed_in)
 
@@ -428,53 +437,58 @@ class Standardisation:
 
     def apply(self, inputs: Array) -> None:
         """Standardise planes in place, shape (halves, pixels, planes), clipped to 4 standard deviations."""
-        for column, (mean, std) in enumerate(zip(self.mean, self.std, strict=True)):
-            plane = inputs[:, :, column]
-            plane -= mean
-            plane /= std
-            np.clip(plane, -LARGEST_INPUT, LARGEST_INPUT, out=plane)
+        for part in _parts(inputs):
+            np.clip(
+                (part - self.mean) / self.std, -LARGEST_INPUT, LARGEST_INPUT, out=part, casting="same_kind"
+            )
 
 
 def standardisation_of(inputs: Array) -> Standardisation:
     """Return mean and standard deviation of every plane of shape (halves, pixels, planes)."""
-    planes = range(inputs.shape[2])
-    mean = np.array([inputs[:, :, plane].mean(dtype=np.float64) for plane in planes])
-    centred = np.empty(inputs.shape[:2], np.float32)
-    std = np.empty(len(planes), np.float32)
-    for plane in planes:
-        np.subtract(inputs[:, :, plane], mean[plane], out=centred)
-        std[plane] = max(float(centred.std(dtype=np.float64)), _LEAST_SPREAD)
-    return Standardisation(mean, std)
+    count = inputs.shape[0] * inputs.shape[1]
+    mean = sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs)) / count
+    variance = sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs)) / count
+    return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
 
 
-def estimate_error(
-    evidence: Evidence, fused_a: Array, fused_b: Array, pixels: Indices | slice = slice(None)
-) -> Array:
+def _parts(inputs: Array) -> Iterator[Array]:
+    """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
+    flat = inputs.reshape(-1, inputs.shape[2])
+    for first in range(0, len(flat), _PART_PIXELS):
+        yield flat[first : first + _PART_PIXELS]
+
+
+def pilots_at(evidence: Evidence, pixels: Indices) -> tuple[Halves, ...]:
+    """Return the pilots at some pixels, shape (pixels, 3)."""
+    return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots)
+
+
+def estimate_error(pilots: Sequence[Halves], scale: float, fused_a: Array, fused_b: Array) -> Array:
     """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
 
-    ``fused_a`` and ``fused_b`` are outputs made of one half each at ``pixels``, shape (pixels, 3), in the
-    units of the evidence; 0.01 is in the renderer's. The variance of f is (fused_a - fused_b)^2 / 4 in the
-    mean. Its bias is not known; it is taken for `_BIAS` times the median squared difference of f and the
-    pilots, which blur in different ways, or for less if the noisy halves do not allow as much in the mean
-    (see `_told_by_halves`).
+    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs made of one half each,
+    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
+    is (fused_a - fused_b)^2 / 4 in the mean. Its bias is not known; it is taken for `_BIAS` times the median
+    squared difference of f and the pilots, which blur in different ways, or for less if the noisy halves do
+    not allow as much in the mean (see `_told_by_halves`).
     """
     output = np.float32(0.5) * (fused_a + fused_b)
-    epsilon = _epsilon_of_renderer(evidence.scale)
+    epsilon = _epsilon_of_renderer(scale)
     squared = (fused_a - fused_b) ** 2 / 4
     variance = np.empty(len(output), np.float32)
     bias = np.empty(len(output), np.float32)
-    pilots = [(a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots[1:]]
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
         relative = 1 / (output[part] ** 2 + epsilon)
         with np.errstate(over="ignore"):
             apart = [
                 channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
-                for a, b in pilots
+                for a, b in computed
             ]
             variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
             bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
-    told, standard_error = _told_by_halves(evidence.halves, fused_a, fused_b, pixels, epsilon)
+    told, standard_error = _told_by_halves(pilots[0], fused_a, fused_b, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
@@ -491,9 +505,7 @@ def _relative(squared: Array, denominator: Array) -> Array:
     return relative
 
 
-def held_out_error(
-    evidence: Evidence, fused_a: Array, fused_b: Array, pixels: Indices | slice = slice(None)
-) -> float:
+def held_out_error(pilots: Sequence[Halves], fused_a: Array, fused_b: Array) -> float:
     """Return the mean of the same error as the other half tells it: without bias, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
@@ -501,8 +513,8 @@ def held_out_error(
     pilot, far less noisy but a little blurred.
     """
     epsilon = np.float32(RELMSE_EPSILON)
-    for witnesses in evidence.pilots[:2]:
-        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, pixels, epsilon)
+    for witnesses in pilots[:2]:
+        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, epsilon)
         if standard_error < _SURE * mean:
             break
     relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
@@ -510,7 +522,7 @@ def held_out_error(
 
 
 def _told_by_halves(
-    witnesses: Halves, fused_a: Array, fused_b: Array, pixels: Indices | slice, epsilon: np.float32
+    witnesses: Halves, fused_a: Array, fused_b: Array, epsilon: np.float32
 ) -> tuple[float, float]:
     """Return the mean error that independent witnesses tell, and its standard error.
 
@@ -518,7 +530,7 @@ def _told_by_halves(
     f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of one
     output; the mean of two has half of that.
     """
-    a, b = (image.reshape(-1, 3)[pixels] for image in witnesses)
+    a, b = (image.reshape(-1, 3) for image in witnesses)
     crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
     error = channel_mean(_relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
     spread = float(error.std(dtype=np.float64))
@@ -546,14 +558,14 @@ def result_from_fused(
     image = np.float32(0.5) * (fused[0] + fused[1])
     if whole is not None:
         image = with_all_samples(fused, whole, threads)
-    error = estimate_error(evidence, fused_a, fused_b).reshape(*shape[:2], 1)
+    error = estimate_error(evidence.pilots, evidence.scale, fused_a, fused_b).reshape(*shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
     squared: Array = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
-    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, slice(None), np.float32(RELMSE_EPSILON))
+    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
     if told >= error_of_input:
         notes.append("the input is as good as anything fitted to it, and is returned as it is")
         image, fused = evidence.mean, evidence.halves

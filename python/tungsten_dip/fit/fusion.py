@@ -7,9 +7,12 @@ linear in the scored half, so noise adds a constant to the loss and nothing to t
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from threading import Event
 
 import numpy as np
 import torch
@@ -83,20 +86,30 @@ def fit_fusion(
         return evidence
     start = start_of_training(evidence, settings.seed, warm_start)
     evidence = start.evidence
-    whole_pilots: tuple[FloatImage, ...] = ()
-    if previous is None:
-        progress(0.7, "all samples")
-        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
-    # The network is too small to share: on a busy machine threads would only wait for one another.
-    with compute_device(settings, most_threads=1) as device:
+    threads = settings.threads or os.cpu_count() or 1
+    given_up = Event()
+    # The network is too small to share: on a busy machine threads would only wait for one another. While one
+    # of them trains it, the others make the pilots of all samples.
+    with compute_device(settings, most_threads=1) as device, ThreadPoolExecutor(1) as beside:
+        whole_pilots = beside.submit(
+            lambda: (
+                pilots_of_all_samples(evidence, buffers, settings, started, max(threads - 1, 1), given_up)
+                if previous is None
+                else ()
+            )
+        )
+        if threads == 1:
+            wait([whole_pilots])
         network = _TorchNetwork(start.weights, start.examples, device)
         steps = settings.iterations or preset.steps
         training = train(network, start, settings, steps, started, progress)
+        if training.interrupted:
+            given_up.set()
         shape = evidence.mean.shape
         fused = network.fuse_all(0).reshape(shape), network.fuse_all(1).reshape(shape)
         whole = None
-        if whole_pilots:
-            by_a, by_b = (network.fuse_all(half, whole_pilots).reshape(shape) for half in (0, 1))
+        if images := whole_pilots.result():
+            by_a, by_b = (network.fuse_all(half, images).reshape(shape) for half in (0, 1))
             whole = np.float32(0.5) * (by_a + by_b)
     result = result_from_fused(
         evidence,

@@ -21,6 +21,7 @@ from tungsten_dip.fit.evidence import (
     held_out_error,
     loss_weights,
     network_inputs,
+    pilots_at,
     standardisation_of,
     with_best_reference,
 )
@@ -161,6 +162,7 @@ class Training:
     """How far a training went."""
 
     steps_done: int = 0
+    interrupted: bool = False
     history: list[HistoryPoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -183,14 +185,16 @@ def train(
     order = rng.permutation(pixels)
     held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
     probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
+    pilots = pilots_at(start.evidence, probe)
     done = Training(notes=list(start.notes))
 
     def estimate(step: int) -> tuple[float, float]:
         """Return the error, and what the other half says of it."""
         fused_a, fused_b = (network.fuse(half, probe) for half in (0, 1))
-        error = float(estimate_error(start.evidence, fused_a, fused_b, probe).mean(dtype=np.float64))
+        errors = estimate_error(pilots, start.evidence.scale, fused_a, fused_b)
+        error = float(errors.mean(dtype=np.float64))
         done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
-        return error, held_out_error(start.evidence, fused_a, fused_b, probe)
+        return error, held_out_error(pilots, fused_a, fused_b)
 
     every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
     begun, deadline = time.perf_counter(), started + (settings.time_budget_s or math.inf)
@@ -223,6 +227,7 @@ def train(
                 done.notes.append(f"stopped at step {step}: the error falls no further")
                 break
     except KeyboardInterrupt:
+        done.interrupted = True
         done.notes.append(f"interrupted at step {done.steps_done}: the image is what was reached by then")
     if warm:
         network.load(best_weights)

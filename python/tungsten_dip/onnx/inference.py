@@ -100,7 +100,9 @@ def _infer_fusion(
     training = Training()
     if refit_steps:
         model, evidence, training = _refitted(model, evidence, settings, refit_steps, started, progress)
-    whole_pilots = () if previous is not None else pilots_of_all_samples(evidence, buffers, settings, started)
+    whole_pilots: tuple[FloatImage, ...] = ()
+    if previous is None:
+        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started, settings.threads or 0)
     fused, whole = _fused(model, evidence, whole_pilots, settings.threads or 0)
     result = result_from_fused(
         evidence, fused, whole, settings, started, training.steps_done, training.history, training.notes
