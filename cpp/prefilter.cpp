@@ -166,7 +166,7 @@ class TileFilter {
     std::vector<HalvesRow<tile_size>> weights_;     // [row] sum of the weights, half a's from b's patches
     std::vector<HalvesRow<tile_size>> patch_rows_;  // [padded row] distances summed over a patch's columns
 
-    [[nodiscard]] int count() const { return rounded_up(columns_.size()); }
+    [[nodiscard]] std::size_t count() const { return static_cast<std::size_t>(rounded_up(columns_.size())); }
     [[nodiscard]] std::size_t tile_row(int y) const { return static_cast<std::size_t>(y - rows_.begin); }
     [[nodiscard]] std::size_t sum_row(int c, int y) const {
         return static_cast<std::size_t>(c) * tile_size + tile_row(y);
@@ -187,7 +187,7 @@ class TileFilter {
     // columns of patches.
     TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, HalvesRow<tile_size>& out) const {
         HalvesRow<padded_size> distances;  // NOLINT(*-member-init): the first channel sets them
-        const int padded_count = rounded_up(columns_.size() + 2 * patch_radius);
+        const auto padded_count = static_cast<std::size_t>(rounded_up(columns_.size() + 2 * patch_radius));
         const int x = columns_.begin - patch_radius;
         const float share = 1.0F / static_cast<float>(feature_.a.channels());
         for (int c = 0; c < feature_.a.channels(); ++c) {
@@ -197,7 +197,7 @@ class TileFilter {
             const float* a_there = feature_.a.row(c, y + dy) + x + dx;
             const float* b_there = feature_.b.row(c, y + dy) + x + dx;
             const float* variance_there = feature_.variance.row(c, y + dy) + x + dx;
-            for (std::size_t i = 0; i < static_cast<std::size_t>(padded_count); ++i) {
+            for (std::size_t i = 0; i < padded_count; ++i) {
                 const float noise = variance[i] + std::min(variance[i], variance_there[i]);
                 const float scale = share / (k_squared_ * (variance[i] + variance_there[i]) + epsilon);
                 const float difference_a = a[i] - a_there[i];
@@ -210,7 +210,7 @@ class TileFilter {
                     sum_b + std::min((difference_b * difference_b - noise) * scale, largest_distance);
             }
         }
-        for (std::size_t i = 0; i < static_cast<std::size_t>(count()); ++i) {
+        for (std::size_t i = 0; i < count(); ++i) {
             float sum_a = 0;
             float sum_b = 0;
             for (std::size_t tap = 0; tap < patch_size; ++tap) {
@@ -226,7 +226,7 @@ class TileFilter {
         // Each half has the weights of the other.
         HalvesRow<tile_size> weight;  // NOLINT(*-member-init): filled below
         const HalvesRow<tile_size>* patches = &patch_rows_[tile_row(y)];
-        const auto size = static_cast<std::size_t>(count());
+        const std::size_t size = count();
         constexpr float scale = 1.0F / (patch_size * patch_size);
         for (std::size_t i = 0; i < size; ++i) {
             float sum_a = 0;
