@@ -126,8 +126,8 @@ struct SearchWindow {
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
 // `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
-// after filtering. A value is passed through unchanged where it and the pixels next to it have no noise:
-// their halves agree and their variances are 0.
+// after filtering. A value is passed through unchanged where its pixel and those next to it have hardly
+// any noise: their halves differ, and their standard deviations are, by less than a thousandth of it.
 void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads);
 
 // --- regression.cpp

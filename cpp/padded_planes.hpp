@@ -9,12 +9,16 @@
 
 namespace tungsten_dip {
 
+// Neighbouring pixels that are computed together.
+constexpr int lanes = 8;
+constexpr int rounded_up(int count, int multiple) { return (count + multiple - 1) / multiple * multiple; }
+
 // An image's channels one after the other, [channel][y][x], with its border repeated `margin` pixels
 // outwards: no loop needs to ask where the image ends.
 class PaddedPlanes {
   public:
     // How far a loop over whole vectors may read beyond the margin; what it finds there is of no use.
-    static constexpr std::size_t overread = 7;
+    static constexpr std::size_t overread = lanes - 1;
 
     PaddedPlanes(int channels, int height, int width, int margin)
         : channels_(channels),

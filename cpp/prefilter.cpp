@@ -30,11 +30,7 @@ constexpr float largest_distance = 1e4F;
 constexpr float least_noise = 1e-3F;
 
 constexpr int tile_size = 48;
-
-// Pixels that are computed together: rows are as many as they need to be full.
-constexpr int lanes = 8;
-constexpr int rounded_up(int count) { return (count + lanes - 1) / lanes * lanes; }
-constexpr int padded_size = rounded_up(tile_size + 2 * patch_radius);
+constexpr int padded_size = rounded_up(tile_size + 2 * patch_radius, lanes);
 
 struct Feature {
     PaddedPlanes a;
@@ -166,7 +162,9 @@ class TileFilter {
     std::vector<HalvesRow<tile_size>> weights_;     // [row] sum of the weights, half a's from b's patches
     std::vector<HalvesRow<tile_size>> patch_rows_;  // [padded row] distances summed over a patch's columns
 
-    [[nodiscard]] std::size_t count() const { return static_cast<std::size_t>(rounded_up(columns_.size())); }
+    [[nodiscard]] std::size_t count() const {
+        return static_cast<std::size_t>(rounded_up(columns_.size(), lanes));
+    }
     [[nodiscard]] std::size_t tile_row(int y) const { return static_cast<std::size_t>(y - rows_.begin); }
     [[nodiscard]] std::size_t sum_row(int c, int y) const {
         return static_cast<std::size_t>(c) * tile_size + tile_row(y);
@@ -187,7 +185,8 @@ class TileFilter {
     // columns of patches.
     TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, HalvesRow<tile_size>& out) const {
         HalvesRow<padded_size> distances;  // NOLINT(*-member-init): the first channel sets them
-        const auto padded_count = static_cast<std::size_t>(rounded_up(columns_.size() + 2 * patch_radius));
+        const auto padded_count =
+            static_cast<std::size_t>(rounded_up(columns_.size() + 2 * patch_radius, lanes));
         const int x = columns_.begin - patch_radius;
         const float share = 1.0F / static_cast<float>(feature_.a.channels());
         for (int c = 0; c < feature_.a.channels(); ++c) {

@@ -41,13 +41,9 @@ struct Tile {
 using FeatureRows = std::array<const float*, max_features>;
 using FeatureValues = std::array<float, max_features>;
 
-// Neighbouring pixels that are computed together.
-constexpr int lanes = 8;
 constexpr int planes_at_once = 8;
 using Lanes [[gnu::vector_size(lanes * sizeof(float))]] = float;
 using LanesInMemory [[gnu::aligned(alignof(float)), gnu::may_alias]] = Lanes;
-
-constexpr int rounded_up(int count, int multiple) { return (count + multiple - 1) / multiple * multiple; }
 
 // distances = the noise-corrected squared differences of one row of the guide from another, in units of its
 // noise (Rousselle et al. 2012, equation 2), averaged over channels.

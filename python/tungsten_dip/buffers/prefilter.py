@@ -18,8 +18,9 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
 
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
     Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it.
-    Values without noise in and next to their pixel pass through to the bit, and so do features without
-    halves. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
+    Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit, and
+    so do features without halves. Normals are not normalised again. Expects sanitised buffers. ``threads``
+    None uses every core.
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
