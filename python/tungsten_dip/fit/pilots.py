@@ -50,6 +50,10 @@ _ACROSS_EDGES = 0.3
 
 _CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 
+_STRAY = 4.0
+_STRAY_RADIUS = 2
+"""Emission of one half so many times what the other half saw in the 5x5 pixels around was seen by chance."""
+
 _SAMPLES_OF_FIRST_WINDOW = 12
 """About how many independent neighbours the 7x7 window of the first guide averages, used without halves."""
 
@@ -169,7 +173,7 @@ def guidance_of_halves(
     shown = tuple(color / np.float32(scale) for color in colors)
     albedos: tuple[FloatImage, ...] = ()
     if buffers.albedo is not None:
-        given = buffers.albedo
+        given = _without_stray_emission(buffers.albedo, threads)
         # Above 1 it is light that a surface emits, which the colour must show too. What the colour does not
         # show is a wild value, and would be smeared over its surroundings.
         albedos = tuple(
@@ -217,6 +221,24 @@ def guidance_of_halves(
             Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, threads)
         )
     return tuple(guidance)
+
+
+def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
+    """Return an albedo above 1 only where both halves saw light emitted, in about the same place.
+
+    A path that chanced upon a light through glass or a mirror is noise, and left to the colour: as emission
+    it would stay where it is, and be believed.
+    """
+    a, b = albedo.half_a, albedo.half_b
+    if a is None or b is None or not (albedo.mean > 1).any():
+        return albedo
+    limits = (
+        1 + np.float32(_STRAY * (2 * _STRAY_RADIUS + 1) ** 2) * np.maximum(around, 0)
+        for around in (_core.box_mean(np.maximum(half - 1, 0), _STRAY_RADIUS, threads) for half in (b, a))
+    )
+    kept_a, kept_b = (np.minimum(half, limit) for half, limit in zip((a, b), limits, strict=True))
+    taken = np.float32(0.5) * ((a - kept_a) + (b - kept_b))
+    return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
 
 
 def _feature_planes(
