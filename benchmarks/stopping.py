@@ -14,7 +14,7 @@ import numpy as np
 
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, fusion
+from tungsten_dip.fit import FitSettings, denoise, fusion, torch_network
 from tungsten_dip.fit.evidence import Evidence, Indices
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import Preset
@@ -30,7 +30,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
     found: list[float] = []
     starts: list[Start] = []
 
-    class Watched(fusion._TorchNetwork):
+    class Watched(torch_network.TorchNetwork):
         steps = 0
 
         def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
@@ -46,7 +46,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
         return starts[-1]
 
     with (
-        mock.patch.object(fusion, "_TorchNetwork", Watched),
+        mock.patch.object(torch_network, "TorchNetwork", Watched),
         mock.patch.object(fusion, "start_of_training", start),
     ):
         denoise(bench_set.buffers, FitSettings(preset))

@@ -478,10 +478,33 @@ def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
     assert np.abs(image[far].mean() / color.mean[far].mean() - 1) < 0.05
 
 
+def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> None:
+    """A path that happens upon a lamp through glass must not leave a bright pixel."""
+
+    def with_lamp(*halves: str) -> RenderBuffers:
+        def lit(buffer: Buffer) -> Buffer:
+            planes = {name: image.copy() for name, image in buffer.planes()}
+            for half in halves:
+                planes[half][20, 30] += 30
+                planes["mean"][20, 30] += 15
+            return Buffer(**planes)
+
+        albedo = render.buffers.albedo
+        assert albedo is not None
+        return render.buffers.with_quantities(color=lit(render.buffers.color), albedo=lit(albedo))
+
+    for halves, emission in ((("half_a",), [0.0, 0.0]), (("half_a", "half_b"), [30.0, 30.0])):
+        found = [g.emission[20, 30].mean() for g in _guidance(with_lamp(*halves))]
+        np.testing.assert_allclose(found, emission, rtol=0.05)
+    image = denoise(with_lamp("half_a"), _settings(iterations=20)).color
+    around = np.delete(image[18:23, 28:33].reshape(25, 3), 12, axis=0)
+    assert image[20, 30].mean() < 2 * around.mean()
+
+
 def test_adam_is_that_of_torch() -> None:
     import torch
 
-    from tungsten_dip.fit.fusion import ADAM_BETAS, ADAM_EPSILON, _Adam
+    from tungsten_dip.fit.torch_network import ADAM_BETAS, ADAM_EPSILON, _Adam
 
     generator = torch.Generator().manual_seed(0)
     ours = [torch.randn(3, 5, generator=generator), torch.randn(7, generator=generator)]

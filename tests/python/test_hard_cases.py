@@ -129,7 +129,7 @@ def double_precision():
 
 @pytest.mark.usefixtures("double_precision")
 def test_gradients_of_the_fusion_loss() -> None:
-    from tungsten_dip.fit import fusion
+    from tungsten_dip.fit.torch_network import TorchNetwork
     from tungsten_dip.fit.training import Examples
 
     rng = np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_gradients_of_the_fusion_loss() -> None:
     for layer, (inputs, outputs) in enumerate(((planes, hidden), (hidden, hidden), (hidden, choices)), 1):
         weights[f"layer{layer}.weight"] = rng.normal(0, 0.5, (outputs, inputs, 1, 1))
         weights[f"layer{layer}.bias"] = rng.normal(0, 0.5, outputs)
-    network = fusion._TorchNetwork(weights, examples, torch.device("cpu"))
+    network = TorchNetwork(weights, examples, torch.device("cpu"))
     half, pixel = np.repeat([0, 1], pixels), np.tile(np.arange(pixels), 2)
 
     def loss() -> float:

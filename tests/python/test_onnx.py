@@ -131,7 +131,7 @@ def test_inference_repeats_the_fit(fitted: FitResult, model: Model, frame: Synth
 
 @pytest.mark.parametrize("size", SIZES)
 def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, int], model: Model) -> None:
-    from tungsten_dip.fit.fusion import _TorchNetwork
+    from tungsten_dip.fit.torch_network import TorchNetwork
 
     assert model.layout is not None
     assert model.standardisation is not None
@@ -146,7 +146,7 @@ def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, in
     model.standardisation.apply(flat)
     choices = pilots.reshape(2, model.layout.choices, 3, -1).transpose(0, 3, 1, 2).copy()
     examples = Examples(flat, choices, choices[:, :, 0], flat[:, :, :1])
-    network = _TorchNetwork(model.weights, examples, torch.device("cpu"))
+    network = TorchNetwork(model.weights, examples, torch.device("cpu"))
     for half in (0, 1):
         expected = network.fuse(half, slice(None)).T.reshape(3, height, width)
         np.testing.assert_allclose(color[half], expected, rtol=1e-4)
@@ -780,7 +780,7 @@ def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
 
 @pytest.mark.parametrize("pixels", [1, 37, 480])
 def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
-    from tungsten_dip.fit.fusion import _TorchNetwork
+    from tungsten_dip.fit.torch_network import TorchNetwork
 
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3)
@@ -789,7 +789,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
         weights[name] = value + rng.normal(0, 0.3, value.shape).astype(np.float32)
     half, pixel = rng.integers(2, size=pixels), rng.integers(480, size=pixels)
 
-    in_torch = _TorchNetwork(weights, examples, torch.device("cpu"))
+    in_torch = TorchNetwork(weights, examples, torch.device("cpu"))
     in_onnx = OnnxNetwork(weights, examples, threads=1)
     proto = training_step(len(layout.planes), layout.choices)
     onnx.checker.check_model(proto, full_check=True)

@@ -13,7 +13,6 @@ from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
-from tungsten_dip.report.page import report_page
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -91,6 +90,8 @@ def write_report(
     path: Path, title: str, buffers: RenderBuffers, result: FitResult, tonemap: str, remarks: Sequence[str]
 ) -> None:
     """Write the HTML page whole or not at all."""
+    from tungsten_dip.report.page import report_page  # imports all of the scene layer
+
     page = report_page(title, buffers, result, tonemap, remarks)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
