@@ -220,8 +220,10 @@ def test_interrupt_returns_the_average_so_far():
 
     interrupted = fit_paper(noise_buffers(), settings(iterations=9), stop)
     assert interrupted.iterations == 3
+    assert interrupted.interrupted
     assert "interrupted at iteration 3 of 9" in interrupted.notes
     whole = fit_paper(noise_buffers(), settings(iterations=3))
+    assert not whole.interrupted
     np.testing.assert_array_equal(interrupted.color, whole.color)
 
 

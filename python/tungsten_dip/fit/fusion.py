@@ -128,4 +128,4 @@ def fit_fusion(
         layout=evidence.layout,
         standardisation=start.standardisation,
     )
-    return replace(result, model=model)
+    return replace(result, model=model, interrupted=training.interrupted)

@@ -159,7 +159,7 @@ def fit_paper(
     total = settings.iterations or ITERATIONS
     notes = [*_notes_on_method(buffers, settings), *images.notes]
     history = []
-    iteration = 0
+    iteration, interrupted = 0, False
     with compute_device(settings) as device:
         fit = PaperFit(images, settings, device, warm_start)
         try:
@@ -180,6 +180,7 @@ def fit_paper(
         except KeyboardInterrupt:
             if iteration == 0:
                 raise
+            interrupted = True
             notes.append(f"interrupted at iteration {iteration} of {total}")
         else:
             if iteration < total:
@@ -188,7 +189,14 @@ def fit_paper(
     model = Model(settings.network, images.planes, weights, settings, None, source_sha256(buffers))
     seconds = time.perf_counter() - start
     return FitResult(
-        color, settings, seconds, iteration, model=model, history=tuple(history), notes=tuple(notes)
+        color,
+        settings,
+        seconds,
+        iteration,
+        model=model,
+        history=tuple(history),
+        interrupted=interrupted,
+        notes=tuple(notes),
     )
 
 

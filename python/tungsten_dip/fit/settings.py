@@ -75,8 +75,8 @@ class FitResult:
     around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
     half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their
     mean (but for fireflies). These are None where the buffers hold no independent evidence. ``model`` is
-    the fitted network, None where there was none to fit. ``notes`` says in one line each what evidence was
-    missing and what that meant.
+    the fitted network, None where there was none to fit. ``interrupted`` tells that Ctrl-C ended the fit
+    early. ``notes`` says in one line each what evidence was missing and what that meant.
     """
 
     color: FloatImage
@@ -88,4 +88,5 @@ class FitResult:
     halves: tuple[FloatImage, FloatImage] | None = None
     model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()
+    interrupted: bool = False
     notes: tuple[str, ...] = field(default=())

@@ -115,7 +115,7 @@ def _infer_fusion(
             source_sha256=source_sha256(buffers),
         )
     progress(1.0, "inferred")
-    return replace(result, model=model)
+    return replace(result, model=model, interrupted=training.interrupted)
 
 
 def _refitted(

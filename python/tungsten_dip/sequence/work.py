@@ -128,7 +128,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, progress: Progress) -> 
     camera = None if frame.scene is None else load_scene(frame.scene).camera
     followed = follower.denoise(buffers, camera, progress)
     result = followed.result
-    if any(note.startswith("interrupted") for note in result.notes):
+    if result.interrupted:
         # The fit has ended early, which is no reason for a sequence to go on with a worse frame.
         raise KeyboardInterrupt
     record = Record(
