@@ -14,9 +14,10 @@ import numpy as np
 
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, fusion, torch_network
+from tungsten_dip.fit import FitSettings, denoise, fusion
 from tungsten_dip.fit.evidence import Evidence, Indices
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import Start, start_of_training
 from tungsten_dip.report.metrics import compare
@@ -30,7 +31,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
     found: list[float] = []
     starts: list[Start] = []
 
-    class Watched(torch_network.TorchNetwork):
+    class Watched(PointwiseNetwork):
         steps = 0
 
         def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
@@ -46,7 +47,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
         return starts[-1]
 
     with (
-        mock.patch.object(torch_network, "TorchNetwork", Watched),
+        mock.patch.object(fusion, "PointwiseNetwork", Watched),
         mock.patch.object(fusion, "start_of_training", start),
     ):
         denoise(bench_set.buffers, FitSettings(preset))

@@ -56,6 +56,10 @@ def test_another_name_is_an_attribute_error():
         "import tungsten_dip; tungsten_dip.FitSettings, tungsten_dip.read_buffers, tungsten_dip.load_scene",
         "from tungsten_dip.cli.tungsten_dip import main; main(['denoise', '--help'])",
         "from tungsten_dip.cli.tungsten import main; main([])",
+        "import numpy as np, tungsten_dip as dip;"
+        "a, b = np.random.default_rng(0).random((2, 32, 32, 3), np.float32);"
+        "noisy = dip.Buffer((a + b) / 2, half_a=a, half_b=b);"
+        "assert dip.denoise(dip.RenderBuffers(noisy), dip.FitSettings(preset='draft')).model",
     ],
 )
 def test_torch_and_mitsuba_load_only_when_needed(program):

@@ -566,7 +566,10 @@ def test_texts_that_are_no_duration(text):
 
 def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
     monkeypatch.setattr("tungsten_dip.fit.find_spec", lambda name: None)
-    assert tungsten.main(["--dip-denoise", "-d", str(tmp_path / "out"), str(scene)]) == 2
+    assert (
+        tungsten.main(["--dip-denoise", "--dip-preset", "paper", "-d", str(tmp_path / "out"), str(scene)])
+        == 2
+    )
     captured = capfd.readouterr()
     assert "pip install 'tungsten-dip[fit]'" in captured.err
     assert "Traceback" not in captured.err

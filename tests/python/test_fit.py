@@ -23,8 +23,6 @@ from tungsten_dip.fit.pilots import (
     guidance_of_halves,
 )
 
-pytest.importorskip("torch")
-
 
 def _settings(**changes: Any) -> FitSettings:
     return FitSettings(**{"preset": "draft", "iterations": 30, "threads": 1, "device": "cpu", **changes})
@@ -500,27 +498,6 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
     image = denoise(with_lamp("half_a"), _settings(iterations=20)).color
     around = np.delete(image[18:23, 28:33].reshape(25, 3), 12, axis=0)
     assert image[20, 30].mean() < 2 * around.mean()
-
-
-def test_adam_is_that_of_torch() -> None:
-    import torch
-
-    from tungsten_dip.fit.torch_network import ADAM_BETAS, ADAM_EPSILON, _Adam
-
-    generator = torch.Generator().manual_seed(0)
-    ours = [torch.randn(3, 5, generator=generator), torch.randn(7, generator=generator)]
-    theirs = [value.clone().requires_grad_() for value in ours]
-    adam = _Adam(ours)
-    optimizer = torch.optim.Adam(theirs, betas=ADAM_BETAS, eps=ADAM_EPSILON)
-    for step in range(1, 8):
-        gradients = [torch.randn(value.shape, generator=generator) for value in ours]
-        adam.step(gradients, 0.1 / step)
-        optimizer.param_groups[0]["lr"] = 0.1 / step
-        for value, gradient in zip(theirs, gradients, strict=True):
-            value.grad = gradient
-        optimizer.step()
-    for value, expected in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(value, expected.detach())
 
 
 @pytest.mark.parametrize(

@@ -128,35 +128,6 @@ def double_precision():
 
 
 @pytest.mark.usefixtures("double_precision")
-def test_gradients_of_the_fusion_loss() -> None:
-    from tungsten_dip.fit.torch_network import TorchNetwork
-    from tungsten_dip.fit.training import Examples
-
-    rng = np.random.default_rng(0)
-    planes, choices, pixels, hidden = 4, 3, 7, 5
-    examples = Examples(
-        rng.normal(size=(2, pixels, planes)),
-        rng.random((2, pixels, choices, 3)),
-        rng.random((2, pixels, 3)),
-        rng.random((2, pixels, 1)),
-    )
-    weights = {}
-    for layer, (inputs, outputs) in enumerate(((planes, hidden), (hidden, hidden), (hidden, choices)), 1):
-        weights[f"layer{layer}.weight"] = rng.normal(0, 0.5, (outputs, inputs, 1, 1))
-        weights[f"layer{layer}.bias"] = rng.normal(0, 0.5, outputs)
-    network = TorchNetwork(weights, examples, torch.device("cpu"))
-    half, pixel = np.repeat([0, 1], pixels), np.tile(np.arange(pixels), 2)
-
-    def loss() -> float:
-        fused = np.stack([network.fuse(0, slice(None)), network.fuse(1, slice(None))])
-        return float(np.mean((fused - examples.wanted) ** 2 * examples.weight))
-
-    for parameter, gradient in zip(network._parameters, network.gradients(half, pixel), strict=True):
-        assert parameter.dtype == torch.float64
-        _check_gradient(parameter, gradient, loss)
-
-
-@pytest.mark.usefixtures("double_precision")
 @pytest.mark.parametrize("network", ["skip", "resnet"])
 def test_gradients_of_the_published_loss(network: str) -> None:
     from tungsten_dip.fit.inputs import paper_images

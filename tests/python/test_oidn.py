@@ -83,7 +83,6 @@ def test_without_the_package_the_command_that_installs_it_is_told(render, withou
 
 def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
     """Each half's image comes from that half alone; the result is no worse than without it."""
-    pytest.importorskip("torch")
     render = make_render(spp=4)
 
     def error(pilot):
@@ -99,6 +98,5 @@ def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
 
 
 def test_as_a_pilot_it_must_be_installed(render, without_pyoidn):
-    pytest.importorskip("torch")
     with pytest.raises(InputError, match=r"tungsten-dip\[oidn\]"):
         denoise(render.buffers, FitSettings(pilot="oidn"))

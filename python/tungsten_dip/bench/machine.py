@@ -5,9 +5,19 @@ from __future__ import annotations
 import os
 import platform
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
-PACKAGES = ("tungsten-dip", "torch", "numpy", "pyoidn", "mitsuba", "flip-evaluator", "scikit-image")
+PACKAGES = (
+    "tungsten-dip",
+    "onnxruntime",
+    "torch",
+    "numpy",
+    "pyoidn",
+    "mitsuba",
+    "flip-evaluator",
+    "scikit-image",
+)
 
 
 def cpu_model() -> str:
@@ -28,10 +38,11 @@ def machine_facts(threads: int | None = None) -> list[tuple[str, str]]:
         ("threads in use", str(threads or os.cpu_count())),
         ("system", f"{platform.system()} {platform.release()}, Python {platform.python_version()}"),
     ]
-    import torch
+    if find_spec("torch") is not None:
+        import torch
 
-    if torch.cuda.is_available():
-        facts.append(("graphics processor", torch.cuda.get_device_name()))
+        if torch.cuda.is_available():
+            facts.append(("graphics processor", torch.cuda.get_device_name()))
     return facts + [(name, version) for name in PACKAGES if (version := _version(name))]
 
 

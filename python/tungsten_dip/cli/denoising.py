@@ -65,7 +65,7 @@ def denoise_with_progress(
     buffers: RenderBuffers, settings: FitSettings, warm_start: Model | None = None
 ) -> FitResult:
     """Denoise the buffers and show progress on stderr."""
-    from tungsten_dip.fit import denoise  # imports torch
+    from tungsten_dip.fit import denoise
 
     with progress_on_stderr("denoising") as progress:
         return denoise(buffers, settings, progress, warm_start=warm_start)

@@ -88,7 +88,7 @@ def _run(arguments: Sequence[str] | None) -> None:
         for name in (*FIT_OPTIONS, "report", "save_model", "warm_start", "dip_preview"):
             if getattr(options, name) not in (None, False):
                 raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
-    else:
+    elif options.preset == "paper":
         require_torch()
     for name in ("output_file", "hdr_output_file", "report", "save_model"):
         path, count = getattr(options, name), len(options.scenes)

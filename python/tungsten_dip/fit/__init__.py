@@ -1,4 +1,4 @@
-"""Fits: from noisy buffers to a clean image. Importing this does not import torch; `denoise` does."""
+"""Fits: from noisy buffers to a clean image. Only the preset paper imports torch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["FitResult", "FitSettings", "HistoryPoint", "denoise", "require_torch
 def require_torch() -> None:
     """Raise InputError if torch is not installed, without importing it: a render may come before the fit."""
     if find_spec("torch") is None:
-        raise InputError("fitting needs torch; install it with: pip install 'tungsten-dip[fit]'")
+        raise InputError("preset paper needs torch; install it with: pip install 'tungsten-dip[fit]'")
 
 
 def denoise(
@@ -55,14 +55,16 @@ def denoise(
     pilots and constants, and trains for as many steps as the error that the halves tell asks for, at most
     ``settings.iterations``. Without settings, those of the model hold, but for the iterations.
 
-    Raises InputError if the image is empty, a buffer that the settings ask for is missing, or torch is,
-    candidates are of another shape or not finite, or the model does not fit the image or the settings.
+    Raises InputError if the image is empty, what the settings ask for is missing (a buffer, a device, torch
+    for the preset paper), candidates are of another shape or not finite, or the model does not fit the image
+    or the settings.
     """
     if settings is None:
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
-    require_torch()
+    if settings.preset == "paper":
+        require_torch()
     if settings.pilot == "oidn":
         require_oidn()
     given = checked_candidates(buffers, candidates)

@@ -13,8 +13,8 @@ from tungsten_dip.fit.settings import FitSettings
 
 
 @contextmanager
-def compute_device(settings: FitSettings, most_threads: int | None = None) -> Iterator[torch.device]:
-    """Yield the device that the settings ask for, with their number of threads (or fewer) set meanwhile.
+def compute_device(settings: FitSettings) -> Iterator[torch.device]:
+    """Yield the device that the settings ask for, with their number of threads set meanwhile.
 
     Raises InputError if the device is not there.
     """
@@ -22,8 +22,7 @@ def compute_device(settings: FitSettings, most_threads: int | None = None) -> It
         raise InputError("device cuda: expected one that torch can use, found none; use cpu or auto")
     use_cuda = settings.device != "cpu" and torch.cuda.is_available()
     threads_before = torch.get_num_threads()
-    threads = settings.threads or os.cpu_count() or 1
-    torch.set_num_threads(min(threads, most_threads or threads))
+    torch.set_num_threads(settings.threads or os.cpu_count() or 1)
     try:
         yield torch.device("cuda" if use_cuda else "cpu")
     finally:

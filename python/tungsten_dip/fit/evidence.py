@@ -3,8 +3,7 @@
 Before: pilots of both halves, and planes that say of every pixel what its features are, what the pilots say,
 and how well each pilot of one half predicts the other half in the pixels around it (never in the pixel
 itself, whose noise it is scored by: the blind spot of Krull et al. 2019, "Noise2Void"). After: the image, its
-error, and whether it is better than its input. All that learns lies between (`fusion`, or onnxruntime alone
-in `tungsten_dip.onnx`); nothing here needs torch.
+error, and whether it is better than its input. All that learns lies between (`pointwise`).
 """
 
 from __future__ import annotations

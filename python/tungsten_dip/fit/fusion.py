@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from importlib import import_module
 from threading import Event
 
 import numpy as np
@@ -24,13 +23,13 @@ from tungsten_dip.fit.evidence import (
     pilots_of_all_samples,
     result_from_fused,
 )
+from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, check_settings, source_sha256
 from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, FOLLOWING_PILOTS, Pilot
+from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.fit.training import (
-    start_of_training,
-    train,
-)
+from tungsten_dip.fit.training import start_of_training, train
+from tungsten_dip.graphs.sessions import check_device
 from tungsten_dip.progress import Progress, silent
 
 _LARGE_RADIUS = 18
@@ -60,6 +59,7 @@ def fit_fusion(
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
     started = time.perf_counter()
+    check_device(settings.device)
     preset = _PRESETS[settings.preset]
     if warm_start is not None:
         check_settings(warm_start, settings)
@@ -72,21 +72,15 @@ def fit_fusion(
         pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
     asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
     threads = settings.threads or os.cpu_count() or 1
+    evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
+    if isinstance(evidence, FitResult):
+        return evidence
+    start = start_of_training(evidence, settings.seed, warm_start)
+    evidence = start.evidence
+    network = PointwiseNetwork(start.weights, start.examples, settings.device)
+    given_up = Event()
+    # One core trains the network; meanwhile the others make the pilots of all samples.
     with ThreadPoolExecutor(1) as beside:
-        if threads > 1 and buffers.color.has_halves:
-            # To import torch takes about as long as a draft's pilots.
-            beside.submit(import_module, "tungsten_dip.fit.torch_network")
-        evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
-        if isinstance(evidence, FitResult):
-            return evidence
-        start = start_of_training(evidence, settings.seed, warm_start)
-        evidence = start.evidence
-        from tungsten_dip.fit.device import compute_device
-        from tungsten_dip.fit.torch_network import TorchNetwork
-
-        given_up = Event()
-        # The network is too small to share: on a busy machine threads would only wait for one another. While
-        # one of them trains it, the others make the pilots of all samples.
         whole_pilots = beside.submit(
             lambda: (
                 pilots_of_all_samples(evidence, buffers, settings, started, max(threads - 1, 1), given_up)
@@ -96,18 +90,16 @@ def fit_fusion(
         )
         if threads == 1:
             wait([whole_pilots])
-        with compute_device(settings, most_threads=1) as device:
-            network = TorchNetwork(start.weights, start.examples, device)
-            steps = settings.iterations or preset.steps
-            training = train(network, start, settings, steps, started, progress)
-            if training.interrupted:
-                given_up.set()
-            shape = evidence.mean.shape
-            fused = network.fuse_all(0).reshape(shape), network.fuse_all(1).reshape(shape)
-            whole = None
-            if images := whole_pilots.result():
-                by_a, by_b = (network.fuse_all(half, images).reshape(shape) for half in (0, 1))
-                whole = np.float32(0.5) * (by_a + by_b)
+        training = train(network, start, settings, settings.iterations or preset.steps, started, progress)
+        if training.interrupted:
+            given_up.set()
+        images = whole_pilots.result()
+    shape = evidence.mean.shape
+    fused = of_both_halves(lambda half: network.fuse_all(half).reshape(shape), threads)
+    whole = None
+    if images:
+        by_a, by_b = of_both_halves(lambda half: network.fuse_all(half, images).reshape(shape), threads)
+        whole = np.float32(0.5) * (by_a + by_b)
     result = result_from_fused(
         evidence,
         fused,

@@ -1,4 +1,4 @@
-"""How the network that chooses among pilots is trained, whatever computes its steps: torch or onnxruntime."""
+"""How the network that chooses among pilots is trained: on what, how long, and from which weights."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from tungsten_dip.fit.evidence import (
     LARGEST_INPUT,
     Array,
     Evidence,
-    Indices,
     Layout,
     Standardisation,
     estimate_error,
@@ -26,14 +24,11 @@ from tungsten_dip.fit.evidence import (
     with_best_reference,
 )
 from tungsten_dip.fit.model import Model, Weights
+from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE, Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
-HIDDEN = 16
-LEAKY_SLOPE = 0.2
 LEARNING_RATE = 1e-2
-ADAM_BETAS = (0.9, 0.999)
-ADAM_EPSILON = 1e-8
 _HEAD_START = 1.0
 """Logit that the best single pilot starts with."""
 
@@ -56,36 +51,6 @@ _WARM_HISTORY_EVERY = 5
 _WARM_PATIENCE = 3
 _WARM_GAIN = 0.01
 """It is done once this many estimates in a row have not lowered the error by this part."""
-
-
-class Network(Protocol):
-    """The network with its examples (`Examples`) and the state of its optimiser (Adam)."""
-
-    def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
-        """Train on some pixels: the mean of their weighted squared errors falls."""
-
-    def fuse(self, half: int, pixel: Indices | slice) -> Array:
-        """Return the weighted mean of the pilots, shape (pixels, 3)."""
-
-    def weights(self) -> Weights:
-        """Return a copy of the weights."""
-
-    def load(self, weights: Weights) -> None:
-        """Replace the weights."""
-
-
-@dataclass(frozen=True)
-class Examples:
-    """What a network is trained on, flattened; the first axis tells the halves apart.
-
-    ``inputs`` has shape (2, pixels, planes), ``choices`` (2, pixels, pilots, 3), ``wanted``, the other half's
-    colour, (2, pixels, 3), and ``weight``, of the squared error, (2, pixels, 1).
-    """
-
-    inputs: Array
-    choices: Array
-    wanted: Array
-    weight: Array
 
 
 @dataclass(frozen=True)
@@ -168,7 +133,7 @@ class Training:
 
 
 def train(
-    network: Network,
+    network: PointwiseNetwork,
     start: Start,
     settings: FitSettings,
     steps: int,

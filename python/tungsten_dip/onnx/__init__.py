@@ -1,4 +1,4 @@
-"""Fitted networks as ONNX files: saved, loaded, used and trained further by onnxruntime, without torch."""
+"""Fitted networks as ONNX files: saved, loaded, used and trained further."""
 
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx.file import load_model, save_model

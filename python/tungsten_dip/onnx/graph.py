@@ -16,8 +16,8 @@ from onnx import TensorProto
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import LARGEST_INPUT
 from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.training import HIDDEN, LEAKY_SLOPE
-from tungsten_dip.onnx.builder import GraphBuilder
+from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE
+from tungsten_dip.graphs.builder import GraphBuilder
 
 _NORM_EPSILON = 1e-5
 _RESNET_BLOCKS = 10

@@ -1,4 +1,4 @@
-"""Denoise with a network that is fitted already: numpy, the C++ core and onnxruntime, no torch."""
+"""Denoise with a network that is fitted already."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ from tungsten_dip.fit.evidence import (
     planes_of_half,
     result_from_fused,
 )
+from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
-from tungsten_dip.fit.model import Model, check_planes, source_sha256
+from tungsten_dip.fit.model import Model, check_planes
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.fit.training import Training, start_of_training, train
+from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
-from tungsten_dip.onnx.sessions import session_from_proto
-from tungsten_dip.onnx.training_graph import OnnxNetwork
 from tungsten_dip.progress import Progress, silent
 
 _LOG = logging.getLogger(__name__)
@@ -67,12 +66,16 @@ def infer(
         raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
     # A FitSettings checks the threads as well.
     # The time budget was the fit's: what a network makes of an image must not depend on the machine's speed.
-    settings = replace(model.settings, threads=threads, iterations=refit_steps or None, time_budget_s=None)
+    settings = replace(
+        model.settings, threads=threads, iterations=refit_steps or None, time_budget_s=None, device="auto"
+    )
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, threads)
-    if model.layout is not None:
-        result = _infer_fusion(model, buffers, settings, given, previous, refit_steps, progress)
+    if model.layout is not None and refit_steps:
+        result = fit_fusion(buffers, settings, progress, given, model, previous)
+    elif model.layout is not None:
+        result = _infer_fusion(model, buffers, settings, given, previous, progress)
     else:
         if refit_steps or given or previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
@@ -89,7 +92,6 @@ def _infer_fusion(
     settings: FitSettings,
     candidates: Sequence[Halves],
     previous: Halves | None,
-    refit_steps: int,
     progress: Progress,
 ) -> FitResult:
     started = time.perf_counter()
@@ -97,47 +99,13 @@ def _infer_fusion(
     evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):
         return evidence
-    training = Training()
-    if refit_steps:
-        model, evidence, training = _refitted(model, evidence, settings, refit_steps, started, progress)
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
         whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started, settings.threads or 0)
     fused, whole = _fused(model, evidence, whole_pilots, settings.threads or 0)
-    result = result_from_fused(
-        evidence, fused, whole, settings, started, training.steps_done, training.history, training.notes
-    )
-    if training.steps_done:
-        model = replace(
-            model,
-            settings=settings,
-            estimated_relmse=result.estimated_relmse,
-            source_sha256=source_sha256(buffers),
-        )
+    result = result_from_fused(evidence, fused, whole, settings, started, 0, (), ())
     progress(1.0, "inferred")
-    return replace(result, model=model, interrupted=training.interrupted)
-
-
-def _refitted(
-    model: Model,
-    evidence: Evidence,
-    settings: FitSettings,
-    steps: int,
-    started: float,
-    progress: Progress,
-) -> tuple[Model, Evidence, Training]:
-    start = start_of_training(evidence, settings.seed, model)
-    network = OnnxNetwork(start.weights, start.examples, settings.threads or 0)
-    training = train(network, start, settings, steps, started, progress)
-    layout = start.evidence.layout
-    refitted = replace(
-        model,
-        planes=layout.planes,
-        weights=network.weights(),
-        layout=layout,
-        standardisation=start.standardisation,
-    )
-    return refitted, start.evidence, training
+    return replace(result, model=model)
 
 
 def _fused(

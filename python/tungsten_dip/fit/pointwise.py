@@ -1,33 +1,54 @@
-"""The training step of the pointwise network as an ONNX graph of plain operators, and what runs it.
+"""The network that chooses among pilots, pixel by pixel, and its training.
 
-Forward, loss, gradients and the optimiser's update (Adam, Kingma and Ba 2015) are one graph, computed by
-onnxruntime alone. Weights and moments go in and come out as one vector each, so that the update is written
+A training step (forward, loss, gradients and the update of Adam, Kingma and Ba 2015) is one ONNX graph of
+plain operators. For a network as small as this one onnxruntime takes less time than torch, and loads in a
+fiftieth of it. Weights and moments go in and come out as one vector each, so that the update is written
 once. The number of pixels is free.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
 import numpy as np
 import onnx
 
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import Array, Indices
 from tungsten_dip.fit.model import Weights
-from tungsten_dip.fit.training import (
-    ADAM_BETAS,
-    ADAM_EPSILON,
-    HIDDEN,
-    LEAKY_SLOPE,
-    Examples,
-)
-from tungsten_dip.onnx.builder import GraphBuilder
-from tungsten_dip.onnx.sessions import session_from_proto
+from tungsten_dip.graphs.builder import GraphBuilder
+from tungsten_dip.graphs.sessions import Device, session_from_proto
+
+HIDDEN = 16
+LEAKY_SLOPE = 0.2
+ADAM_BETAS = (0.9, 0.999)
+ADAM_EPSILON = 1e-8
+
+_RUN_PIXELS = 1 << 14
+"""Pixels that the network sees at once: what its layers leave stays in the processor's cache."""
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What a network is trained on, flattened; the first axis tells the halves apart.
+
+    ``inputs`` has shape (2, pixels, planes), ``choices`` (2, pixels, pilots, 3), ``wanted``, the other half's
+    colour, (2, pixels, 3), and ``weight``, of the squared error, (2, pixels, 1).
+    """
+
+    inputs: Array
+    choices: Array
+    wanted: Array
+    weight: Array
 
 
 def training_step(planes: int, choices: int) -> onnx.ModelProto:
     """Return the graph of one step.
 
     Inputs: ``inputs`` (M, planes), standardised, ``choices`` (M, pilots, 3), ``wanted`` (M, 3) and ``weight``
-    (M, 1), as in `tungsten_dip.fit.training.Examples`; the vectors ``weights``, ``mean`` and ``square``
+    (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square``
     (Adam's moments) and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs:
     ``loss``, the vector ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
     """
@@ -58,30 +79,33 @@ def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-class OnnxNetwork:
-    """The network in onnxruntime; see `tungsten_dip.fit.training.Network`."""
+class PointwiseNetwork:
+    """The network, its examples and the state of its optimiser."""
 
-    def __init__(self, weights: Weights, examples: Examples, threads: int) -> None:
-        self._examples = examples
+    def __init__(self, weights: Weights, examples: Examples, device: Device = "auto") -> None:
+        self._pixels = examples.inputs.shape[1]
+        # Both halves one after the other: one index for both is gathered far sooner than a pair.
+        self._examples = {
+            part.name: getattr(examples, part.name).reshape(-1, *getattr(examples, part.name).shape[2:])
+            for part in fields(Examples)
+        }
         planes, choices = examples.inputs.shape[2], examples.choices.shape[2]
         self._shapes = weight_shapes(planes, choices)
-        self._step = session_from_proto(training_step(planes, choices), threads)
-        self._fuse = session_from_proto(_forward(planes, choices), threads)
+        # The network is too small to share: threads would only wait for one another.
+        self._step = session_from_proto(training_step(planes, choices), 1, device)
+        self._fuse = session_from_proto(_forward(planes, choices), 1, device)
         self._weights = self._vector(weights)
         self._mean, self._square = np.zeros_like(self._weights), np.zeros_like(self._weights)
         self._steps_done = 0
 
     def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
-        """Do one step of Adam."""
+        """Train on some pixels by one step of Adam: the mean of their weighted squared errors falls."""
         self._steps_done += 1
-        examples = self._examples
+        at = half * self._pixels + pixel
         self._weights, self._mean, self._square = self._step.run(
             ["next_weights", "next_mean", "next_square"],
             {
-                "inputs": examples.inputs[half, pixel],
-                "choices": examples.choices[half, pixel],
-                "wanted": examples.wanted[half, pixel],
-                "weight": examples.weight[half, pixel],
+                **{name: values.take(at, axis=0) for name, values in self._examples.items()},
                 "weights": self._weights,
                 "mean": self._mean,
                 "square": self._square,
@@ -90,11 +114,25 @@ class OnnxNetwork:
             },
         )
 
-    def fuse(self, half: int, pixel: Indices | slice) -> Array:
-        """Return the weighted mean of the pilots, shape (pixels, 3)."""
-        inputs, choices = self._examples.inputs[half, pixel], self._examples.choices[half, pixel]
-        feeds = {"inputs": inputs, "choices": choices, "weights": self._weights}
-        fused: Array = self._fuse.run(["fused"], feeds)[0]
+    def fuse(self, half: int, pixel: Indices) -> Array:
+        """Return the weighted mean of the pilots at some pixels, shape (pixels, 3).
+
+        Raises InputError if it is not finite.
+        """
+        at = half * self._pixels + pixel
+        return self._fused(*(self._examples[name].take(at, axis=0) for name in ("inputs", "choices")))
+
+    def fuse_all(self, half: int, images: Sequence[FloatImage] = ()) -> Array:
+        """Return the weighted mean of the pilots or, by the same weights, of ``images`` at every pixel."""
+        flat = [image.reshape(-1, 3) for image in images]
+        fused = np.empty((self._pixels, 3), np.float32)
+        for first in range(0, self._pixels, _RUN_PIXELS):
+            part = slice(first, min(first + _RUN_PIXELS, self._pixels))
+            of_half = slice(half * self._pixels + part.start, half * self._pixels + part.stop)
+            choices = (
+                np.stack([image[part] for image in flat], 1) if flat else self._examples["choices"][of_half]
+            )
+            fused[part] = self._fused(self._examples["inputs"][of_half], choices)
         return fused
 
     def weights(self) -> Weights:
@@ -112,15 +150,22 @@ class OnnxNetwork:
         """Replace the weights."""
         self._weights = self._vector(weights)
 
+    def _fused(self, inputs: Array, choices: Array) -> Array:
+        feeds = {"inputs": inputs, "choices": choices, "weights": self._weights}
+        fused: Array = self._fuse.run(["fused"], feeds)[0]
+        if not np.isfinite(fused).all():
+            raise InputError("the model gives no finite image: its weights are too large; fit a new one")
+        return fused
+
     def _vector(self, weights: Weights) -> Array:
         return np.concatenate([weights[name].ravel() for name in self._shapes])
 
 
 def _forward(planes: int, choices: int) -> onnx.ModelProto:
-    """Return the graph of `OnnxNetwork.fuse`."""
+    """Return the graph of `PointwiseNetwork.fuse`."""
     build = _Step()
     shapes = weight_shapes(planes, choices)
-    build.forward(shapes)
+    build.add("Transpose", build.forward(shapes)["mixed"], perm=[1, 0], output="fused")
     inputs: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", planes),
         "choices": ("M", choices, 3),
@@ -130,49 +175,61 @@ def _forward(planes: int, choices: int) -> onnx.ModelProto:
 
 
 class _Step(GraphBuilder):
-    """The parts of a step; rows of matrices are pixels."""
+    """The parts of a step; columns of matrices are pixels, as long rows are what a processor is fast at."""
 
     def forward(self, shapes: dict[str, tuple[int, ...]]) -> dict[str, str]:
-        """Compute ``fused``; return the names of the values that the gradients need."""
+        """Compute the pilots' weighted means, ``mixed`` (3, M); return them, and what the gradients need."""
         sizes = [int(np.prod(shape)) for shape in shapes.values()]
         known: dict[str, str] = {}
         for (name, shape), part in zip(shapes.items(), self.split("weights", sizes), strict=True):
-            known[name] = self.add("Reshape", part, self.integers(*shape))
+            as_column = self.integers(*shape) if len(shape) == 2 else self.integers(-1, 1)
+            known[name] = self.add("Reshape", part, as_column)
         x = "inputs"
         for layer in (1, 2, 3):
             known[f"input{layer}"] = x
-            x = self.add("Gemm", x, known[f"layer{layer}.weight"], known[f"layer{layer}.bias"], transB=1)
+            weight, bias = known[f"layer{layer}.weight"], known[f"layer{layer}.bias"]
+            # Pixels are rows in the inputs, and columns from then on.
+            x = self.add("Gemm", weight, x, bias, transB=int(layer == 1))
             if layer < 3:
                 x = known[f"output{layer}"] = self.add("LeakyRelu", x, alpha=LEAKY_SLOPE)
-        known["shares"] = self.add("Softmax", x, axis=1)
-        rows = self.add("Unsqueeze", known["shares"], self.integers(1))
-        self.add("Squeeze", self.add("MatMul", rows, "choices"), self.integers(1), output="fused")
+        # onnxruntime's softmax over the first axis crawls, and so do products of a matrix for every pixel.
+        exp = self.add("Exp", self.add("Sub", x, self.add("ReduceMax", x, self.integers(0))))
+        known["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
+        pilots = shapes["layer3.bias"][0]
+        flat = self.add(
+            "Transpose", self.add("Reshape", "choices", self.integers(-1, 3 * pilots)), perm=[1, 0]
+        )
+        known["choices"] = self.add("Reshape", flat, self.integers(pilots, 3, -1))
+        shared = self.add("Mul", known["choices"], self.add("Unsqueeze", known["shares"], self.integers(1)))
+        known["mixed"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
         return known
 
     def gradient(self, shapes: dict[str, tuple[int, ...]]) -> str:
         """Compute ``loss`` and return its derivatives by the weights, as one vector."""
         known = self.forward(shapes)
-        difference = self.add("Sub", "fused", "wanted")
-        weighted = self.add("Mul", difference, "weight")
+        wanted, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("wanted", "weight"))
+        difference = self.add("Sub", known["mixed"], wanted)
+        weighted = self.add("Mul", difference, weight)
         self.add("ReduceMean", self.add("Mul", weighted, difference), keepdims=0, output="loss")
 
         # loss = mean over pixels and channels of weight * difference^2
-        count = self.add("Cast", self.add("Size", "fused"), to=onnx.TensorProto.FLOAT)
-        by_fused = self.add("Mul", weighted, self.add("Div", self.number(2), count))
-        columns = self.add("Unsqueeze", by_fused, self.integers(2))
-        by_share = self.add("Squeeze", self.add("MatMul", "choices", columns), self.integers(2))
+        count = self.add("Cast", self.add("Size", "wanted"), to=onnx.TensorProto.FLOAT)
+        by_mixed = self.add("Mul", weighted, self.add("Div", self.number(2), count))
+        by_share = self.add(
+            "ReduceSum", self.add("Mul", known["choices"], by_mixed), self.integers(1), keepdims=0
+        )
         # softmax: share * (derivative - mean of the derivatives by shares)
-        mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(1))
+        mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(0))
         by_output = self.add("Mul", known["shares"], self.add("Sub", by_share, mean))
 
         flat = self.integers(-1)
         parts: dict[str, str] = {}
         for layer in (3, 2, 1):
-            by_weight = self.add("Gemm", by_output, known[f"input{layer}"], transA=1)
+            by_weight = self.add("Gemm", by_output, known[f"input{layer}"], transB=int(layer > 1))
             parts[f"layer{layer}.weight"] = self.add("Reshape", by_weight, flat)
-            parts[f"layer{layer}.bias"] = self.add("ReduceSum", by_output, self.integers(0), keepdims=0)
+            parts[f"layer{layer}.bias"] = self.add("ReduceSum", by_output, self.integers(1), keepdims=0)
             if layer > 1:
-                by_input = self.add("MatMul", by_output, known[f"layer{layer}.weight"])
+                by_input = self.add("Gemm", known[f"layer{layer}.weight"], by_output, transA=1)
                 # A leaky ReLU keeps the sign.
                 falls = self.add("Less", known[f"output{layer - 1}"], self.number(0))
                 slope = self.add("Where", falls, self.number(LEAKY_SLOPE), self.number(1))

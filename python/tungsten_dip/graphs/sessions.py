@@ -1,0 +1,32 @@
+"""Where onnxruntime computes."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import onnx
+import onnxruntime as ort
+
+from tungsten_dip.errors import InputError
+
+Device = Literal["auto", "cpu", "cuda"]
+
+_CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+def check_device(device: Device) -> None:
+    """Raise InputError if onnxruntime cannot compute there."""
+    if device == "cuda" and _CUDA not in ort.get_available_providers():
+        raise InputError("device cuda: expected an onnxruntime that can use one, found none; use cpu or auto")
+
+
+def session_from_proto(proto: onnx.ModelProto, threads: int, device: Device = "auto") -> Any:
+    """Return a session that runs a graph of our own; threads 0: every core, auto: a GPU if there is one."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    wanted = (_CPU,) if device == "cpu" else (_CUDA, _CPU)
+    available = ort.get_available_providers()
+    providers = [name for name in wanted if name in available]
+    return ort.InferenceSession(proto.SerializeToString(), options, providers=providers)
