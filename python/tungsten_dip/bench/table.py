@@ -61,7 +61,7 @@ def cells(row: Row) -> list[str]:
     median = row.median
     numbers = (
         (median.psnr, ".2f"),
-        (median.relmse, ".3g"),
+        (median.relmse, "#.3g"),
         (median.flip, ".4f"),
         (median.hdrflip, ".4f"),
         (median.mean_ratio, ".3f"),
@@ -70,7 +70,7 @@ def cells(row: Row) -> list[str]:
     return [
         label,
         seconds_text(median.seconds),
-        *("" if value is None else format(value, form) for value, form in numbers),
+        *("" if value is None else format(value, form).rstrip(".") for value, form in numbers),
     ]
 
 
@@ -78,7 +78,7 @@ def seconds_text(seconds: float | None) -> str:
     """Return seconds with two digits, or nothing where nobody knows them."""
     if seconds is None:
         return ""
-    return f"{seconds:.2g}" if seconds < 10 else f"{seconds:.0f}"
+    return f"{seconds:#.2g}" if seconds < 10 else f"{seconds:.0f}"
 
 
 def repeats_text(repeats: int) -> str:

@@ -130,7 +130,8 @@ class Layout:
 class Evidence:
     """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``pilots`` holds what each pilot makes of both halves, the
+    ``mean`` is the noisy image, without fireflies. ``features`` are those of each half by name, shape (height,
+    width). ``pilots`` holds what each pilot makes of both halves, the
     noisy halves themselves first. ``noises`` is the relative squared difference, shape (height, width, 1), of
     the reference pilot and the half that it has not seen, in the pixels around each. ``guide_noise`` is that
     of the pilots' guides (see `Guides`).
@@ -138,12 +139,13 @@ class Evidence:
 
     scale: float
     mean: FloatImage
-    guidance: tuple[Guidance, ...]
+    features: tuple[dict[str, FloatImage], ...]
     layout: Layout
     pilots: tuple[Halves, ...]
     noises: Halves
     guide_noise: FloatImage
     notes: tuple[str, ...]
+    threads: int
 
     @property
     def halves(self) -> Halves:
@@ -161,11 +163,12 @@ class Evidence:
         def cut(images: Halves) -> Halves:
             return images[0][first:end], images[1][first:end]
 
-        a, b = (guidance.rows(first, end) for guidance in self.guidance)
         return replace(
             self,
             mean=self.mean[first:end],
-            guidance=(a, b),
+            features=tuple(
+                {name: plane[first:end] for name, plane in features.items()} for features in self.features
+            ),
             pilots=tuple(cut(pilot) for pilot in self.pilots),
             noises=cut(self.noises),
             guide_noise=self.guide_noise[first:end],
@@ -305,7 +308,10 @@ def evidence_from_buffers(
         candidate_count = len(images) - 1 - len(described)
         layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], threads)
-    return Evidence(scale, mean, guidance, layout, tuple(images), noises, guides.noise, tuple(notes))
+    features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
+    return Evidence(
+        scale, mean, features, layout, tuple(images), noises, guides.noise, tuple(notes), threads
+    )
 
 
 def pilots_of_all_samples(
@@ -352,9 +358,8 @@ def with_best_reference(evidence: Evidence) -> Evidence:
     denominators = _denominators(evidence.smooth)
     errors = [_errors(pilot, evidence.halves, denominators) for pilot in evidence.pilots]
     layout = replace(evidence.layout, reference=_best_pilot(errors))
-    return replace(
-        evidence, layout=layout, noises=_noises(errors[layout.reference], evidence.guidance[0].threads)
-    )
+    noises = _noises(errors[layout.reference], evidence.threads)
+    return replace(evidence, layout=layout, noises=noises)
 
 
 def _best_pilot(errors: Sequence[Halves]) -> int:
@@ -391,9 +396,9 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
 
     A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
     """
-    threads, layout = evidence.guidance[0].threads, evidence.layout
+    threads, layout = evidence.threads, evidence.layout
     for name in layout.features:
-        yield _feature(evidence.guidance[half], name)
+        yield evidence.features[half][name]
     noise = evidence.noises[half]
     yield np.log(noise + np.float32(1e-4))[:, :, 0]
     base = _log_level(evidence.pilots[layout.reference][half])
@@ -423,7 +428,7 @@ def network_inputs(evidence: Evidence) -> Array:
         for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
             column[:] = plane.ravel()
 
-    of_both_halves(fill, evidence.guidance[0].threads)
+    of_both_halves(fill, evidence.threads)
     return inputs
 
 
@@ -550,7 +555,7 @@ def result_from_fused(
 
     ``whole`` is what its weights for both halves, in the mean, make of all samples.
     """
-    threads = evidence.guidance[0].threads
+    threads = evidence.threads
     shape = fused[0].shape
     fused = with_what_was_lost(evidence.halves, fused)
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
@@ -600,7 +605,7 @@ def _check_fits(layout: Layout, guidance: Guidance, candidates: int) -> None:
 def _feature(guidance: Guidance, name: str) -> FloatImage:
     if name in guidance.names:
         return guidance.features[:, :, guidance.names.index(name)]
-    return np.full(guidance.features.shape[:2], guidance.left_out[name], np.float32)
+    return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
 
 
 def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: int | None) -> Halves:

@@ -133,11 +133,6 @@ class Guidance:
     smooth_emission: FloatImage
     threads: int
 
-    def rows(self, first: int, end: int) -> Guidance:
-        """Return the guidance of some rows alone."""
-        names = ("features", "albedo", "emission", "smooth_emission")
-        return replace(self, **{name: getattr(self, name)[first:end] for name in names})
-
     def irradiance(self, color: FloatImage) -> FloatImage:
         """Return what falls on the surfaces that a half shows in ``color``."""
         irradiance: FloatImage = (color - self.emission) / self.albedo

@@ -91,7 +91,7 @@ def _start(
     warm: bool,
     notes: tuple[str, ...] = (),
 ) -> Start:
-    """Return the start with its examples, whose copy of the pilots becomes the evidence's."""
+    """Return the start with its examples; its evidence holds no second copy of what they hold."""
     pixels = inputs.shape[1]
     choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
     for index, pilot in enumerate(evidence.pilots):
@@ -99,11 +99,12 @@ def _start(
             choices[half, :, index] = pilot[half].reshape(pixels, 3)
     wanted = np.stack([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.stack([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
-    # One copy of the pilots is enough: large images need gigabytes for each.
+    # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
     pilots = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
     examples = Examples(inputs, choices, wanted, weight)
-    return Start(replace(evidence, pilots=pilots), examples, standardisation, weights, warm, notes)
+    evidence = replace(evidence, pilots=pilots, features=({}, {}))
+    return Start(evidence, examples, standardisation, weights, warm, notes)
 
 
 def first_weights(layout: Layout, seed: int) -> Weights:
