@@ -130,11 +130,11 @@ class Layout:
 class Evidence:
     """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``features`` are those of each half by name, shape (height,
-    width). ``pilots`` holds what each pilot makes of both halves, the
-    noisy halves themselves first. ``noises`` is the relative squared difference, shape (height, width, 1), of
-    the reference pilot and the half that it has not seen, in the pixels around each. ``guide_noise`` is that
-    of the pilots' guides (see `Guides`).
+    ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
+    (height, width). ``pilots`` holds what each pilot makes of both halves, the noisy halves themselves first.
+    ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and the
+    half that it has not seen, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
+    `Guides`).
     """
 
     scale: float
@@ -309,9 +309,7 @@ def evidence_from_buffers(
         layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], threads)
     features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
-    return Evidence(
-        scale, mean, features, layout, tuple(images), noises, guides.noise, tuple(notes), threads
-    )
+    return Evidence(scale, mean, features, layout, tuple(images), noises, guides.noise, tuple(notes), threads)
 
 
 def pilots_of_all_samples(
