@@ -266,11 +266,13 @@ def test_all_that_can_be_measured_here_is_shown_in_table_plot_and_page(folder, b
 
 
 def test_peers_that_are_missing_are_left_out_and_that_is_said(bench_set, fits, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("tungsten_dip.fit.oidn.find_spec", lambda name: None)
+    for module in ("fit", "fit.oidn"):
+        monkeypatch.setattr(f"tungsten_dip.{module}.find_spec", lambda name: None)
     with caplog.at_level(logging.INFO):
-        plan = replace(QUICK, kinds=("oidn", "nfor", "samples"), repeats=1)
+        plan = replace(QUICK, kinds=("paper", "oidn", "nfor", "samples"), repeats=1)
         (found,) = run_pareto([bench_set], plan, tmp_path)
     assert [row.label for row in found.rows] == ["noisy"]
+    assert "pip install 'tungsten-dip[fit]'" in caplog.text
     assert "pip install 'tungsten-dip[oidn]'" in caplog.text
     assert "NFOR is left out" in caplog.text
 
@@ -283,7 +285,7 @@ def test_the_front_is_what_no_faster_method_beats(bench_set):
     rows = SetRows(bench_set, [row(*point) for point in points])
     assert [rows.rows[index].label for index in rows.front()] == ["a", "b"]
     lines = markdown_table(rows).splitlines()
-    assert lines[2].startswith("| **a** | 5 | inf | 0.1 |")
+    assert lines[2].startswith("| **a** | 5.0 | inf | 0.100 |")
     assert lines[5].startswith("| d |  | inf |")
 
 

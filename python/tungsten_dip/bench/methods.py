@@ -15,6 +15,7 @@ from tungsten_dip.bench.nfor import nfor_image
 from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import require_torch
 from tungsten_dip.fit.oidn import Quality, oidn_image, require_oidn
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.progress import Progress
@@ -109,11 +110,11 @@ def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]
         raise InputError(f"expected a scene for each of {len(sets)} sets, got {len(plan.scenes)}")
     if plan.denoiser is not None and not plan.denoiser.is_file():
         raise InputError(f"{plan.denoiser}: no such file; name Tungsten's command denoiser")
-    has_oidn = "oidn" in plan.kinds and _has_oidn()
+    plan = replace(plan, kinds=tuple(kind for kind in plan.kinds if _can_run(kind)))
     methods = {}
     for index, bench_set in enumerate(sets):
         scene = plan.scenes[index] if plan.scenes else None
-        methods[bench_set.name] = list(_methods(bench_set, plan, scene, has_oidn))
+        methods[bench_set.name] = list(_methods(bench_set, plan, scene))
     return methods
 
 
@@ -128,16 +129,17 @@ def settings_text(settings: FitSettings) -> str:
     )
 
 
-def _has_oidn() -> bool:
+def _can_run(kind: str) -> bool:
+    required = {"paper": require_torch, "oidn": require_oidn}
     try:
-        require_oidn()
+        required.get(kind, lambda: None)()
     except InputError as error:
         _LOG.warning("%s; measured without", error)
         return False
     return True
 
 
-def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool) -> Iterator[Method]:
+def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None) -> Iterator[Method]:
     noisy = Outcome(NOISY, bench_set.buffers.color.mean, None)
     yield Method(
         NOISY, (NOISY,), (NOISY,), "", lambda repeat, progress: [noisy], timed=False, pictured=(NOISY,)
@@ -146,7 +148,7 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool
         for preset in plan.presets:
             settings = FitSettings(preset, threads=plan.threads)
             yield _ours(bench_set, OURS, preset, preset, settings, pictured=True)
-        if has_oidn:
+        if "oidn" in plan.kinds:
             guided = FitSettings("final", pilot="oidn", threads=plan.threads)
             yield _ours(bench_set, OURS, "final, with OIDN as a pilot", "with OIDN", guided, pictured=True)
     if "budgets" in plan.kinds:
@@ -156,7 +158,7 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None, has_oidn: bool
             yield _ours(bench_set, IN_TIME, f"final in {mark}", mark, settings, pictured=False)
     if "paper" in plan.kinds:
         yield _paper(bench_set, FitSettings("paper", threads=plan.threads), plan.paper_iterations)
-    if has_oidn:
+    if "oidn" in plan.kinds:
         for quality in get_args(Quality):
             yield _oidn(bench_set, quality, plan.threads)
     if "nfor" in plan.kinds:

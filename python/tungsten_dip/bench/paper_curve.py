@@ -7,9 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from tungsten_dip.buffers import FloatImage, RenderBuffers, sanitize
-from tungsten_dip.fit.device import compute_device
 from tungsten_dip.fit.inputs import paper_images
-from tungsten_dip.fit.paper import PaperFit
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
@@ -37,6 +35,9 @@ def paper_curve(
 
     Raises InputError as `fit.paper.fit_paper` does.
     """
+    from tungsten_dip.fit.device import compute_device
+    from tungsten_dip.fit.paper import PaperFit
+
     start = time.perf_counter()
     looking_s = 0.0
     points = []

@@ -67,8 +67,10 @@ def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
     from tungsten_dip.hosts import render
 
     tiny = cropped(bench_set.buffers, (slice(16), slice(16)))
-    if not {OURS, IN_TIME, PAPER}.isdisjoint(series):
+    if not {OURS, IN_TIME}.isdisjoint(series):
         denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
+    if PAPER in series:
+        denoise(tiny, FitSettings("paper", iterations=1, threads=plan.threads))
     if OIDN in series:
         oidn_image(tiny.color.mean, threads=plan.threads)
     if SAMPLES in series:
