@@ -37,10 +37,15 @@ EXTRA_BY_MODULE = {
 _NO_MEMORY = (
     "t allocate memory",
     "Cannot allocate memory",
+    "Failed to allocate memory",
+    "bad_alloc",
     "failed to map segment",
     "error return without exception set",
+    # A thread needs memory for its stack.
+    "can't start new thread",
+    "Resource temporarily unavailable",
 )
-"""What torch, the loader of libraries and CPython say in place of raising MemoryError."""
+"""What torch, onnxruntime, the loader of libraries and CPython say in place of raising MemoryError."""
 
 SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 

@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--scheme", choices=get_args(types["scheme"]), help="(default: iic)")
     paper.add_argument("--channels", metavar="8,16,...", type=integers, help="(default: 8,16,32,64,128)")
 
-    infer = commands.add_parser("infer", help="denoise with a network that was saved, without torch")
+    infer = commands.add_parser("infer", help="denoise with a network that was saved")
     infer.set_defaults(action=_infer)
     add = infer.add_argument
     add("model", metavar="M.onnx", type=Path, help="what denoise --save-model wrote")
