@@ -17,6 +17,8 @@ constexpr float infinite_radiance = 1e36F;  // sums of some hundreds overflow
 constexpr float infinite_normal = 1e6F;
 constexpr float infinite_albedo = 1e12F;  // which holds the radiance of lights, too
 constexpr int reach = 16;                 // how far a sane pixel may be from the one it mends
+// Of the radiance around, the largest part that a filter's negative lobe takes away; more is no lobe.
+constexpr double largest_lobe = 0.25;
 
 struct Rules {
     bool nonnegative;
@@ -146,6 +148,27 @@ void fill_from_other(const Image& image, const std::vector<Position>& pending, c
     }
 }
 
+// Sets to 0 what a filter's lobe has made negative, and takes as much from the values around: their sum,
+// which is what the filter was given, stays. Zeros alone would brighten the image, its halves even more.
+void settle_lobes(const Image& image, Rules rules) {
+    for_each_position(image, [&](Position at) {
+        float& value = image.at(at.y, at.x, at.c);
+        if (!(value < 0)) return;
+        double around = 0;
+        for_neighbourhood(image, at, [&](int y, int x) {
+            const float other = image.at(y, x, at.c);
+            if (rules.sane(other)) around += other;
+        });
+        if (-value > largest_lobe * around) return;
+        const auto kept = static_cast<float>(1 + value / around);
+        for_neighbourhood(image, at, [&](int y, int x) {
+            float& other = image.at(y, x, at.c);
+            if (rules.sane(other)) other *= kept;
+        });
+        value = 0;
+    });
+}
+
 // Sets negative values to 0, and infinite ones as well if asked to.
 void zero(const Image& image, Rules rules, bool infinite) {
     for (float* value = image.data; value != image.data + image.size(); ++value) {
@@ -157,6 +180,11 @@ void zero(const Image& image, Rules rules, bool infinite) {
 void mend_values(const Buffer& buffer, Quantity quantity) {
     const Rules rules = value_rules(quantity);
     const bool is_depth = quantity == Quantity::depth;
+    if (quantity == Quantity::color) {
+        for (const Image& image : {buffer.mean, buffer.half_a, buffer.half_b}) {
+            if (image.known()) settle_lobes(image, rules);
+        }
+    }
     if (buffer.half_a.known()) zero(buffer.half_a, rules, is_depth);
     if (buffer.half_b.known()) zero(buffer.half_b, rules, is_depth);
     // The mean of halves of which one met something and one did not is their mean, not the sky.

@@ -121,6 +121,30 @@ void a_sane_plane_stands_for_the_others() {
     CHECK(nothing.at(20, 20) == 0);
 }
 
+void lobes_keep_the_light_around_them() {
+    Pixels mean(1, 5, 1, 4.0F);
+    mean.at(0, 1) = -1;
+    mean.at(0, 3) = -3;  // as much as no lobe takes from 4 + 4 beside it
+    mend(only_mean(mean), Quantity::color);
+    CHECK(mean.at(0, 0) == 3.5F && mean.at(0, 1) == 0 && mean.at(0, 2) == 3.5F);
+    CHECK(mean.at(0, 3) == 0 && mean.at(0, 4) == 4);
+
+    Pixels albedo(1, 3, 1, 4.0F);
+    albedo.at(0, 1) = -1;
+    mend(only_mean(albedo), Quantity::albedo);
+    CHECK(albedo.at(0, 0) == 4 && albedo.at(0, 1) == 0);
+
+    Pixels alone(1, 1, 1, -1.0F);
+    mend(only_mean(alone), Quantity::color);
+    CHECK(alone.at(0, 0) == 0);
+
+    Pixels wild(1, 3, 1, inf);
+    wild.at(0, 0) = -inf;
+    wild.at(0, 1) = -1;
+    mend(only_mean(wild), Quantity::color);
+    CHECK(wild.at(0, 1) == 0);
+}
+
 void wild_normals_come_from_the_neighbours() {
     Pixels normal(1, 3, 3, 0.6F);
     normal.at(0, 1) = 1e19F;
@@ -167,6 +191,7 @@ int main() {
     lost_values_come_from_the_neighbours();
     the_sky_has_depth_0();
     a_sane_plane_stands_for_the_others();
+    lobes_keep_the_light_around_them();
     wild_normals_come_from_the_neighbours();
     variance_follows_from_the_halves();
     empty_images_are_fine();

@@ -132,6 +132,23 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
     assert sanitize(mended)[1] == ()
 
 
+def test_what_negative_lobes_lack_comes_from_the_light_around(render: SyntheticRender) -> None:
+    def sharpened(image: FloatImage) -> FloatImage:
+        return np.asarray(1.4 * image - 0.2 * (np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)))
+
+    planes = {
+        name: plane if name == "variance" else sharpened(plane)
+        for name, plane in render.buffers.color.planes()
+    }
+    buffers = render.buffers.with_quantities(color=Buffer(**planes))
+    mended, _ = sanitize(buffers)
+    for name in ("mean", "half_a", "half_b"):
+        before, after = getattr(buffers.color, name), getattr(mended.color, name)
+        assert (before < 0).any()
+        assert (after >= 0).all()
+        assert after.mean() == pytest.approx(before.mean(), rel=1e-3)
+
+
 def test_without_halves_the_neighbours_tell() -> None:
     mean = np.full((3, 3, 3), 2, np.float32)
     variance = np.full((3, 3, 3), 0.5, np.float32)

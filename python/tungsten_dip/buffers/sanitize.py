@@ -12,7 +12,8 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
     """Mend NaN, infinite and negative values; return buffers and, for the log, a line per mended quantity.
 
     No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative), and so does an
-    infinite depth (1e9 and more), which marks the sky. Everything else, also normals of 1e6 and an albedo of
+    infinite depth (1e9 and more), which marks the sky. What a filter's negative lobes lack is taken from the
+    radiance around, so that the mean stays. Everything else, also normals of 1e6 and an albedo of
     1e12 and more, is rebuilt: the mean and the halves from one another, a variance from the halves, and what
     remains from the sane pixels around it or, far from any, from the half that is sane.
     Arrays without defects are shared with ``buffers``, which are not modified. ``threads`` None uses every
