@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO
 import pytest
 
 from tungsten_dip.buffers.model import Buffer
@@ -130,8 +131,23 @@ def foggy(**integrator: Any) -> dict[str, Any]:
     return scene
 
 
+def bumpy() -> dict[str, Any]:
+    """The room with a height map on its floor and on a cube."""
+    scene = copy.deepcopy(ROOM)
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 3}
+    for bsdf in scene["bsdfs"]:
+        if bsdf["name"] in ("floor", "plastic"):
+            bsdf["bump"] = bump
+    scene["primitives"][3] |= {
+        "type": "cube",
+        "transform": {"position": [0.5, 0.5, 0], "rotation": [0, 30, 0]},
+    }
+    return scene
+
+
 CASES = {
     "tent": ROOM,
+    "bump": bumpy(),
     **{
         name: changed("camera", reconstruction_filter=name)
         for name in ("dirac", "box", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos")
@@ -151,6 +167,12 @@ CASES = {
 def test_same_picture_up_to_noise(name: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(CASES[name]))
+    rows, columns = np.indices((24, 32))
+    heights = 128 + 60 * (np.sin(columns * 6 * np.pi / 32) + np.cos(rows * 4 * np.pi / 24))
+    image = OpenImageIO.ImageOutput.create(str(tmp_path / "heights.png"))
+    image.open(str(tmp_path / "heights.png"), OpenImageIO.ImageSpec(32, 24, 1, "uint8"))
+    image.write_image(np.ascontiguousarray(heights[:, :, None], np.uint8))
+    image.close()
     subprocess.run([Path(str(BUILD)) / "tungsten", path.name], cwd=tmp_path, check=True, capture_output=True)
     theirs = read_buffers(tmp_path)
     ours = render(load_scene(path))

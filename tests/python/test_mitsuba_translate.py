@@ -504,6 +504,62 @@ def test_media_are_built_only_where_they_fill_something(folder: Path, used: bool
     assert any(shape.is_medium_transition() for shape in scene.shapes()) == used
 
 
+# --- Bump maps --------------------------------------------------------------------------------------
+
+BUMPY = {**GREY, "bump": "colour.png"}
+TEXEL_STEP = 4 / 255
+
+
+def write_slope(folder: Path) -> None:
+    """Write a height map that rises to the right, by the same step from texel to texel."""
+    write_image(
+        folder / "heights.png", np.tile(np.arange(0, 256, 4, dtype=np.uint8)[None, :, None], (8, 1, 3))
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "tangent"),
+    [("quad", 8.0), ("cube", 1.0), ("mesh", 1.0)],
+)
+def test_height_map_turns_the_normal_by_differences_of_texels(
+    shape: str, tangent: float, tmp_path: Path
+) -> None:
+    # A slope as high as the tangent is long turns the normal by 45 degrees away from a light overhead.
+    write_slope(tmp_path)
+    (tmp_path / "plate.obj").write_text(
+        "v -4 0 -4\nv 4 0 -4\nv 4 0 4\nv -4 0 4\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+        "f 1/1 3/3 2/2\nf 1/1 4/4 3/3\n"
+    )
+    camera = {"transform": {"position": [1, 5, 0.01], "look_at": [1, 0, 0], "up": [0, 0, 1]}, "fov": 10}
+    light = {"type": "point", "transform": {"position": [0, 9000, 0]}, "power": 1e8}
+    height = tangent / (2 * TEXEL_STEP)
+    # Beneath a bent normal light leaks into the cube, and out again.
+    direct = {"type": "path_tracer", "max_bounces": 2}
+    means = []
+    for bump in ({"type": "checker"}, {"type": "bitmap", "file": "heights.png", "scale": height}):
+        primitive = {
+            "quad": {"type": "quad", "transform": {"scale": [8, 1, 8]}},
+            "cube": {"type": "cube", "transform": {"scale": [8, 8, 8], "position": [0, -4, 0]}},
+            "mesh": {"type": "mesh", "file": "plate.obj"},
+        }[shape]
+        thing = {**primitive, "bsdf": {**GREY, "bump": bump}}
+        means.append(render(tmp_path, [thing, light], camera, integrator=direct).color.mean)
+    assert means[0].min() > 0
+    assert means[1] / means[0] == pytest.approx(math.sqrt(0.5), rel=1e-3)
+
+
+def test_height_map_leaves_triangles_without_area_in_uv_flat(folder: Path) -> None:
+    (folder / "plate.obj").write_text("v -4 0 -4\nv 4 0 -4\nv 4 0 4\nvt 0 0\nf 1/1 3/1 2/1\n")
+    camera = {"transform": {"position": [1, 5, -1], "look_at": [1, 0, -1.01], "up": [0, 0, 1]}, "fov": 10}
+    light = {"type": "point", "transform": {"position": [0, 9000, 0]}, "power": 1e8}
+    plate = {"type": "mesh", "file": "plate.obj"}
+    bumpy, flat = (
+        render(folder, [{**plate, "bsdf": bsdf}, light], camera).color.mean for bsdf in (BUMPY, GREY)
+    )
+    assert flat.min() > 0
+    assert bumpy == pytest.approx(flat, rel=1e-5)
+
+
 # --- Refusals ---------------------------------------------------------------------------------------
 
 
@@ -530,7 +586,11 @@ REFUSED: dict[str, Json] = {
     "coloured rough_dielectric": surface(
         {"type": "rough_dielectric", "albedo": 0.5, "enable_refraction": False}
     ),
-    "bump mapping": surface({**GREY, "bump": {"type": "checker"}}),
+    "bump mapping of another shape": {"primitives": [{"type": "sphere", "bsdf": BUMPY}]},
+    "bump mapping with enable_consistency_checks": {
+        **surface(BUMPY),
+        "integrator": {"type": "path_tracer", "enable_consistency_checks": True},
+    },
     "texture of type ies": surface({"type": "lambert", "albedo": {"type": "ies", "file": "colour.png"}}),
     "smooth_coat over a BSDF that transmits": surface(
         {"type": "smooth_coat", "substrate": {"type": "dielectric"}}

@@ -347,7 +347,7 @@ class VoxelMedium(Medium):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bsdf:
-    """How a surface reflects and transmits. ``bump`` is a height map in scene units."""
+    """How a surface reflects and transmits. ``bump`` is a height map."""
 
     kind: ClassVar[str] = ""
     name: str = ""

@@ -6,9 +6,9 @@ Tungsten turns a BSDF that does not transmit towards the viewer, which Mitsuba's
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
-from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, texture_node
+from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, slopes_node, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant
 from tungsten_dip.scene import types as ts
 
@@ -21,25 +21,50 @@ _EUMELANIN = (0.419, 0.697, 1.37)
 _PHEOMELANIN = (0.187, 0.4, 1.05)
 
 
-def bsdf_object(t: Translation, bsdf: ts.Bsdf, uv: Matrix = UV, *, faces_viewer: bool = False) -> Any:
+Tangents = Literal["unit", "edges"]
+"""How long the tangents are that a height map bends: 1, or as long as the edges of the shape."""
+
+
+def bsdf_object(
+    t: Translation,
+    bsdf: ts.Bsdf,
+    uv: Matrix = UV,
+    *,
+    tangents: Tangents | None = None,
+    faces_viewer: bool = False,
+) -> Any:
     """Return the Mitsuba BSDF for a surface with this parameterisation, and note its albedo texture.
 
-    ``faces_viewer`` is for hair on curves whose normal Tungsten turns towards the viewer.
+    ``tangents`` are those of Tungsten's shape, None where ours has others. ``faces_viewer`` is for hair on
+    curves whose normal Tungsten turns towards the viewer.
 
     Raises InputError for what has no counterpart.
     """
-    key = ("bsdf", bsdf, uv.tobytes().hex(), faces_viewer)
+    bent = has_slopes(bsdf)
+    key = ("bsdf", bsdf, uv.tobytes().hex(), tangents if bent else None, faces_viewer)
     found = t.made(key)
     if found is not None:
         return found
     outer, t.place = t.place, f"{t.place}, {_named(bsdf)}" if t.place else _named(bsdf)
-    if bsdf.bump is not None and not is_constant(bsdf.bump):
-        raise t.unsupported("bump mapping")
     node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(t, bsdf, uv)
+    if bsdf.bump is not None and bent:
+        if tangents is None:
+            raise t.unsupported("bump mapping of another shape than a mesh, a quad or a cube")
+        if t.source.integrator.enable_consistency_checks:
+            raise t.unsupported("bump mapping with enable_consistency_checks")
+        slopes = slopes_node(t, bsdf.bump, uv)
+        # Outside of "twosided": Tungsten turns the bent normal towards the viewer.
+        node = {"type": "tungsten_bump", "nested": node, "slopes": slopes, "unit": tangents == "unit"}
     built = t.add_object("bsdf", node)
     t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
     t.place = outer
     return t.remember(key, built)
+
+
+def has_slopes(bsdf: ts.Bsdf) -> bool:
+    """Whether a height map bends the surface: of all textures Tungsten knows the slopes of bitmaps alone."""
+    flat = ts.ConstantTexture | ts.CheckerTexture | ts.DiskTexture | ts.BladeTexture
+    return bsdf.bump is not None and not isinstance(bsdf.bump, flat)
 
 
 def _named(bsdf: ts.Bsdf) -> str:

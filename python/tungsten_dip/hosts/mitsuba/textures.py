@@ -74,6 +74,21 @@ def texture_node(
     raise t.unsupported(f"a texture of type {texture.kind}")
 
 
+def slopes_node(t: Translation, texture: Texture, uv: Matrix = UV) -> Node:
+    """Return the texture of three channels that "tungsten_bump" expects of a height map.
+
+    Between texels Tungsten interpolates their slopes; it repeats every height map and scales each.
+
+    Raises InputError for anything but a bitmap, and for an image that cannot be read.
+    """
+    if not isinstance(texture, BitmapTexture):
+        raise t.unsupported(f"bump mapping by a texture of type {texture.kind}")
+    heights = bitmap_pixels(t, texture, "average")[:, :, 0] * texture.scale
+    across, down = (np.roll(heights, -1, axis) - np.roll(heights, 1, axis) for axis in (1, 0))
+    slopes = np.stack((across, down, np.zeros_like(heights)), axis=2)
+    return _bitmap_node(slopes, uv, clamp=False, nearest=False)
+
+
 def is_constant(texture: Texture, value: Vec3 | None = None) -> bool:
     """Whether a texture is one colour everywhere, and that colour if one is given."""
     return isinstance(texture, ConstantTexture) and (value is None or texture.value == value)

@@ -1,0 +1,82 @@
+// tungsten_bump: another BSDF on a surface whose shading normal a height map bends, as Tungsten bends it: by
+// the differences of texels, however far apart these are on the surface.
+//
+//   (nested)   the BSDF
+//   slopes     texture of three channels: what the height gains from the texel on the left of a place to the
+//              one on its right, and from the one above to the one below; the third is not used
+//   unit       bool: tangents are of length 1 (on meshes and cubes), not as long as the edges (on quads)
+#include "tungsten_bsdf.hpp"
+
+namespace mitsuba {
+
+template <typename Float, typename Spectrum>
+class Bump final : public TungstenBsdf<Float, Spectrum> {
+  public:
+    using Base = TungstenBsdf<Float, Spectrum>;
+    MI_IMPORT_TYPES(Texture, BSDF)
+
+    explicit Bump(const Properties& props) : Base(props) {
+        for (const auto& prop : props.objects())
+            if (auto* bsdf = prop.try_get<BSDF>()) m_nested = bsdf;
+        if (!m_nested) Throw("Expected a nested BSDF on the bent surface");
+        m_slopes = props.get_texture<Texture>("slopes", 0.f);
+        m_unit = props.get<bool>("unit", true);
+        for (size_t i = 0; i < m_nested->component_count(); ++i) Base::add_component(m_nested->flags(i));
+    }
+
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si,
+                                             Float sample1, const Point2f& sample2,
+                                             Mask active) const override {
+        const SurfaceInteraction3f bent = bent_interaction(si);
+        auto [bs, weight] = m_nested->sample(context, bent, sample1, sample2, active);
+        bs.wo = si.to_local(bent.to_world(bs.wo));
+        return {bs, weight};
+    }
+
+    Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask active) const override {
+        return m_nested->eval_null_transmission(si, active);
+    }
+
+    MI_DECLARE_CLASS(Bump)
+
+  protected:
+    std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
+        const SurfaceInteraction3f bent = bent_interaction(si);
+        return m_nested->eval_pdf(BSDFContext(), bent, bent.to_local(si.to_world(wo)), true);
+    }
+
+  private:
+    SurfaceInteraction3f bent_interaction(const SurfaceInteraction3f& si) const {
+        const Vector3f n(si.sh_frame.n);
+        Vector3f tangent = si.dp_du;
+        Vector3f bitangent = si.dp_dv;
+        if (m_unit) {
+            // Tungsten's tangents point the other way where the texture is mirrored.
+            const float side = dr::dot(dr::cross(tangent, bitangent), Vector3f(si.n)) < 0.f ? -1.f : 1.f;
+            tangent = side * dr::normalize(tangent);
+            bitangent = side * dr::normalize(bitangent);
+        }
+        const Color3f slope = m_slopes->eval_3(si, true);
+        tangent += n * (slope.x() - dr::dot(n, tangent));
+        bitangent += n * (slope.y() - dr::dot(n, bitangent));
+        Vector3f bent_n = dr::cross(tangent, bitangent);
+        SurfaceInteraction3f bent = si;
+        if (!(dr::squared_norm(bent_n) > 0.f)) return bent;
+        bent_n = dr::normalize(dr::dot(bent_n, n) < 0.f ? -bent_n : bent_n);
+        tangent -= bent_n * dr::dot(bent_n, tangent);
+        if (!(dr::squared_norm(tangent) > 0.f)) return bent;
+        bent.sh_frame.n = Normal3f(bent_n);
+        bent.sh_frame.s = dr::normalize(tangent);
+        bent.sh_frame.t = dr::cross(bent_n, bent.sh_frame.s);
+        bent.wi = bent.to_local(si.to_world(si.wi));
+        return bent;
+    }
+
+    ref<BSDF> m_nested;
+    ref<Texture> m_slopes;
+    bool m_unit;
+};
+
+}  // namespace mitsuba
+
+TUNGSTEN_EXPORT_PLUGIN(Bump)
