@@ -28,6 +28,7 @@ from tungsten_dip.fit.evidence import (
     Standardisation,
     evidence_from_buffers,
     network_inputs,
+    planes_of_half,
 )
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
@@ -543,7 +544,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (many_nodes, "too many parts"),
     (long_name, "beside the weights"),
     (no_metadata, "tungsten-dip wrote"),
-    (metadata('"format": 2', '"format": 1'), "expected format 2, found 1"),
+    (metadata('"format": 3', '"format": 1'), "expected format 3, found 1"),
     (metadata('"kind": "pointwise"', '"kind": "skip"'), "kind|network"),
     (metadata('"candidates": 0', '"candidates": 1000000000000'), "planes|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
@@ -561,7 +562,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (whole_metadata("[" * 100_000), "JSON"),
     (whole_metadata("{"), "JSON"),
     (whole_metadata("[]"), "format"),
-    (whole_metadata('{"format": 2}'), "kind"),
+    (whole_metadata('{"format": 3}'), "kind"),
 ]
 
 
@@ -875,6 +876,19 @@ def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
     inner = 28 - PLANES_RADIUS
     np.testing.assert_allclose(upper[:, :inner], whole[:, :inner], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(lower[:, -inner:], whole[:, -inner:], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("changed", ["seen", "scoring"])
+def test_the_network_sees_the_noise_of_no_pixel_at_that_pixel(changed: str, frame: SyntheticRender) -> None:
+    # Neither the half's own, which it would choose for being dark, nor the other's, which it is scored by.
+    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    y, x, half = 11, 17, 0
+    noisy = [image.copy() for image in evidence.halves]
+    noisy[half if changed == "seen" else 1 - half][y, x] *= 3
+    other = replace(evidence, pilots=((noisy[0], noisy[1]), *evidence.pilots[1:]))
+    before, after = (np.stack(list(planes_of_half(e, half)), axis=2) for e in (evidence, other))
+    np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
+    assert np.abs(after - before).max() > 0.01
 
 
 # --- Without torch, and as commands -----------------------------------------------------------------

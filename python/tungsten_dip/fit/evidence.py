@@ -409,7 +409,11 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     for index, pilot in enumerate(evidence.pilots):
         if index == layout.reference:
             continue
-        yield np.clip(_log_level(pilot[half]) - base, -2, 2)[:, :, 0]
+        shown = pilot[half]
+        if index == 0:
+            # Its own noise aside: else a noisy pixel is chosen for being dark by chance.
+            shown = np.maximum(mean_around(shown, 1, threads), 0)
+        yield np.clip(_log_level(shown) - base, -2, 2)[:, :, 0]
         worse = np.minimum(_error(pilot[half], other, denominator), cap) - reference
         for radius in _SCORE_RADII:
             score = mean_around(worse, radius, threads) / (np.float32(0.05) * noise + np.float32(1e-4))

@@ -33,8 +33,8 @@ LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
 """All but the weights: bounds what a parser makes of them."""
 
-_FORMAT = 2
-"""Raised whenever another graph is written."""
+_FORMAT = 3
+"""Raised whenever another graph is written, or the same one sees other planes."""
 
 _PROPERTY = "tungsten_dip"
 _SETTINGS = ("preset", "pilot", "iterations", "network", "inputs", "scheme", "channels", "seed")
