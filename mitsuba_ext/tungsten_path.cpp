@@ -509,7 +509,8 @@ class TungstenPath final : public Variant::Integrator {
         const Rgb emission = emitter.eval(hit);
         if (path.was_specular || !path.samples_lights || is_black(emission)) return emission;
         const Variant::DirectionSample3f towards(&scene, hit, path.vertex);
-        return emission *
+        // Of several lights around the scene a ray sees one, but all light a surface.
+        return emitter.eval_direction(path.vertex, towards) *
                power_heuristic(path.direction_pdf, scene.pdf_emitter_direction(path.vertex, towards));
     }
 

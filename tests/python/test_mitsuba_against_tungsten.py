@@ -145,9 +145,19 @@ def bumpy() -> dict[str, Any]:
     return scene
 
 
+def outdoors() -> dict[str, Any]:
+    """The room without its lamp, under a sky with two suns."""
+    scene = copy.deepcopy(ROOM)
+    sun = {"type": "infinite_sphere_cap", "cap_angle": 3, "emission": 60}
+    faint = {**sun, "cap_angle": 15, "emission": 2, "transform": {"rotation": [-30, 0, 40]}}
+    scene["primitives"][-2:] = [{"type": "infinite_sphere", "emission": 0.5}, sun, faint]
+    return scene
+
+
 CASES = {
     "tent": ROOM,
     "bump": bumpy(),
+    "sky and suns": outdoors(),
     **{
         name: changed("camera", reconstruction_filter=name)
         for name in ("dirac", "box", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos")

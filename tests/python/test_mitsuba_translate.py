@@ -330,6 +330,25 @@ def test_irradiance(folder: Path, light: Json, irradiance_over_pi: float) -> Non
     np.testing.assert_allclose(buffers.color.mean.mean(), expected, rtol=0.02, atol=1e-7)
 
 
+def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -> None:
+    sun = {"type": "infinite_sphere_cap", "cap_angle": 5, "emission": 40}
+    other = {**sun, "cap_angle": 20, "emission": 3, "transform": {"rotation": [0, 0, 30]}}
+    irradiance_over_pi = 1 + 40 * math.sin(math.radians(5)) ** 2
+    irradiance_over_pi += 3 * math.sin(math.radians(20)) ** 2 * math.cos(math.radians(30))
+    up = {"transform": {"position": [0, 1, 0], "look_at": [0, 2, 0], "up": [0, 0, 1]}, "fov": 4}
+    down = {"transform": {"position": [0, 3, 0], "look_at": [0, 0, 0], "up": [0, 0, 1]}, "fov": 4}
+    mirror = {**FLOOR, "bsdf": {"type": "mirror"}}
+    for lights, seen in (
+        ([WHITE_SKY, other, sun], 40),
+        ([sun, WHITE_SKY, other], 1),
+        ([other, sun, WHITE_SKY], 1),
+    ):
+        lit = render(folder, [FLOOR, *lights], DOWN, spp=64).color.mean
+        np.testing.assert_allclose(lit.mean(), 0.5 * irradiance_over_pi, rtol=0.01)
+        np.testing.assert_allclose(render(folder, lights, up).color.mean, seen, rtol=1e-4)
+        np.testing.assert_allclose(render(folder, [mirror, *lights], down).color.mean, seen, rtol=1e-4)
+
+
 def test_without_lights_the_sky_is_white(folder: Path) -> None:
     buffers = render(folder, [{**ball(WHITE), "emission": 0.0}], {"fov": 15})
     np.testing.assert_allclose(buffers.color.mean.mean(), 1.0, rtol=0.02)
@@ -616,7 +635,6 @@ REFUSED: dict[str, Json] = {
     "lambert on curves": {"primitives": [{**CURVES, "mode": "bcsdf_cylinder", "bsdf": GREY}]},
     "shining curves": {"primitives": [{**CURVES, "emission": 1.0}]},
     "texture on curves": {"primitives": [{**CURVES, "bsdf": {"type": "lambert", "albedo": "colour.png"}}]},
-    "more than one light": {"primitives": [WHITE_SKY, WHITE_SKY]},
     "file of instances": {"primitives": [{"type": "instances", "masters": [FLOOR], "instances": "many.bin"}]},
     "cubemap": with_camera(type="cubemap"),
     "equirectangular": with_camera(type="equirectangular"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -58,6 +59,19 @@ def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
 def default_environment() -> Node:
     """Return what Tungsten lights a scene with that has no light: white from everywhere."""
     return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
+
+
+def together(environments: Sequence[tuple[Node, bool]]) -> Node:
+    """Return one emitter for all lights around the scene, since Mitsuba knows but one.
+
+    Every light comes with whether it is a cap, which leaves the others visible beside it.
+    """
+    if len(environments) == 1:
+        return environments[0][0]
+    node: Node = {"type": "tungsten_environments"}
+    for number, (light, is_cap) in enumerate(environments):
+        node |= {f"light_{number}": light, f"cap_{number}": is_cap}
+    return node
 
 
 def envmap_node(

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import logging
 
-from tungsten_dip.hosts.mitsuba.emitters import default_environment, environment_node, point_node
+from tungsten_dip.hosts.mitsuba.emitters import (
+    default_environment,
+    environment_node,
+    point_node,
+    together,
+)
 from tungsten_dip.hosts.mitsuba.sensor import pixel_center, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
-from tungsten_dip.hosts.mitsuba.translation import Translation
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation
 from tungsten_dip.scene import types as ts
 
 _log = logging.getLogger(__name__)
@@ -25,7 +30,8 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     """
     t = Translation(scene)
     integrator = _path_tracer(t, scene.integrator)
-    lights = surroundings = 0
+    lights = 0
+    surroundings: list[tuple[Node, bool]] = []
     for number, primitive in enumerate(scene.primitives):
         t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
         match primitive:
@@ -33,16 +39,18 @@ def translate(scene: ts.Scene) -> TranslatedScene:
                 node = point_node(t, primitive)
             case ts.InfiniteSphere() | ts.InfiniteSphereCap() | ts.Skydome():
                 node = environment_node(t, primitive)
-                surroundings += node is not None
-                if surroundings > 1:
-                    raise t.unsupported("more than one light that surrounds the scene")
+                if node is not None:
+                    surroundings.append((node, isinstance(primitive, ts.InfiniteSphereCap)))
+                continue
             case _:
                 lights += add_shapes(t, primitive)
                 continue
         if node is not None:
             t.add("emitter", node)
             lights += 1
-    if not lights:
+    if surroundings:
+        t.add("emitter", together(surroundings))
+    elif not lights:
         t.add("emitter", default_environment())
     t.scene["sensor"] = sensor_node(t, scene.camera)
     return TranslatedScene(

@@ -1,0 +1,97 @@
+// tungsten_environments: several lights that surround the scene, such as a sky and the sun in it.
+//
+//   light_0, light_1, ...   the emitters, each of which surrounds the scene
+//   cap_0, cap_1, ...       bool: the light leaves the others visible where it is black
+//
+// As in Tungsten, surfaces are lit by all of them, and a ray that leaves the scene sees the last alone.
+#include <mitsuba/core/properties.h>
+#include <mitsuba/render/emitter.h>
+
+#include <algorithm>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "tungsten_bsdf.hpp"
+
+namespace mitsuba {
+
+template <typename Float, typename Spectrum>
+class Environments final : public Emitter<Float, Spectrum> {
+  public:
+    MI_IMPORT_BASE(Emitter, m_flags)
+    MI_IMPORT_TYPES(Scene)
+
+    explicit Environments(const Properties& props) : Base(props) {
+        for (size_t i = 0; props.has_property("light_" + std::to_string(i)); ++i) {
+            auto nested = props.get<ref<Object>>("light_" + std::to_string(i));
+            auto* emitter = dynamic_cast<Base*>(nested.get());
+            if (!emitter || !emitter->is_environment()) Throw("Expected emitters that surround the scene");
+            m_lights.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false)});
+        }
+        if (m_lights.empty()) Throw("Expected nested emitters");
+        m_flags = +EmitterFlags::Infinite;
+    }
+
+    void set_scene(const Scene* scene) override {
+        for (Light& light : m_lights) light.emitter->set_scene(scene);
+    }
+
+    // What a ray sees.
+    Spectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
+        for (auto light = m_lights.rbegin(); light != m_lights.rend(); ++light) {
+            const Spectrum seen = light->emitter->eval(si, active);
+            if (!light->is_cap || dr::any(seen != 0.f)) return seen;
+        }
+        return Spectrum(0.f);
+    }
+
+    std::pair<DirectionSample3f, Spectrum> sample_direction(const Interaction3f& it, const Point2f& sample,
+                                                            Mask active) const override {
+        // One of the lights, each as often; the sample is stretched to be used again.
+        const auto count = static_cast<float>(m_lights.size());
+        const float chosen = std::min(std::floor(sample.x() * count), count - 1.f);
+        const Point2f reused(sample.x() * count - chosen, sample.y());
+        auto [direction, weight] =
+            m_lights[static_cast<size_t>(chosen)].emitter->sample_direction(it, reused, active);
+        if (!(direction.pdf > 0.f)) return {direction, Spectrum(0.f)};
+        direction.pdf = pdf_direction(it, direction, active);
+        direction.emitter = this;
+        return {direction, eval_direction(it, direction, active) / direction.pdf};
+    }
+
+    Float pdf_direction(const Interaction3f& it, const DirectionSample3f& direction,
+                        Mask active) const override {
+        Float sum = 0.f;
+        for (const Light& light : m_lights) sum += light.emitter->pdf_direction(it, direction, active);
+        return sum / static_cast<float>(m_lights.size());
+    }
+
+    // What comes from a direction in all.
+    Spectrum eval_direction(const Interaction3f& /*it*/, const DirectionSample3f& direction,
+                            Mask active) const override {
+        auto si = dr::zeros<SurfaceInteraction3f>();
+        si.wi = -direction.d;
+        Spectrum sum(0.f);
+        for (const Light& light : m_lights) sum += light.emitter->eval(si, active);
+        return sum;
+    }
+
+    ScalarBoundingBox3f bbox() const override { return {}; }
+
+    [[nodiscard]] std::string to_string() const override { return "Environments[]"; }
+
+    MI_DECLARE_CLASS(Environments)
+
+  private:
+    struct Light {
+        ref<Base> emitter;
+        bool is_cap;
+    };
+
+    std::vector<Light> m_lights;
+};
+
+}  // namespace mitsuba
+
+TUNGSTEN_EXPORT_PLUGIN(Environments)
