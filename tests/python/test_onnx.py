@@ -21,17 +21,10 @@ from tungsten_dip.buffers import Buffer, RenderBuffers, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.evidence import (
-    PLANES_RADIUS,
-    Evidence,
-    Layout,
-    Standardisation,
-    evidence_from_buffers,
-    network_inputs,
-    planes_of_half,
-)
+from tungsten_dip.fit.evidence import Evidence, Layout, evidence_from_buffers
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
+from tungsten_dip.fit.planes import PLANES_RADIUS, Standardisation, network_inputs, planes_of_half
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, training_step, weight_shapes
 from tungsten_dip.fit.training import first_weights, start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto

@@ -1,16 +1,10 @@
-"""What is computed of an image before and after the network of the presets draft, balanced and final.
-
-Before: pilots of both halves, and planes that say of every pixel what its features are, what the pilots say,
-and how well each pilot of one half predicts the other half in the pixels around it (never in the pixel
-itself, whose noise it is scored by: the blind spot of Krull et al. 2019, "Noise2Void"). After: the image, its
-error, and whether it is better than its input. All that learns lies between (`pointwise`).
-"""
+"""What is known of an image before a network is fitted to it: its halves, its features, and its pilots."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import Event
 
@@ -22,9 +16,7 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.statistics import halves_independent
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.fireflies import limit_fireflies
-from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
@@ -38,7 +30,6 @@ from tungsten_dip.fit.pilots import (
     guidance_of_halves,
 )
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
-from tungsten_dip.fit.yielding import with_what_was_lost
 from tungsten_dip.progress import Progress
 
 Array = npt.NDArray[np.float32]
@@ -53,42 +44,20 @@ _TYPICAL_RADIANCE = 0.25
 _BRIGHTEST = 1e15
 """Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
 
-_LARGEST_ERROR = 1e30
-"""Larger relative squared errors count as this large: their sums overflow."""
-
 _ONLY_PILOT = Pilot(9, k=1.0)
 """Used alone where nothing can score the pilots."""
 
 _CONVERGED = 1e-5
 """relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
-_LOG_OFFSET = 0.02
-_SCORE_RADII = (2, 4, 8, 16)
-PLANES_RADIUS = max(_SCORE_RADII)
+SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
-_OUTLIER = 20.0
+OUTLIER = 20.0
 """A squared error this many times the local mean is an outlier: capped where it tells of a place's noise."""
-
-_LEAST_NOISE = 1.0
-"""Relative variance of one half's pixel below which less noise does not make a pixel count more."""
-
-_LEAST_SPREAD = 1e-6
-LARGEST_INPUT = 4.0
-_ERROR_RADIUS = 4
-_BIAS = 1.5
-"""What the squared bias is to the median squared difference of the pilots from the result, about."""
 
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
 """Of a time budget, after which no further pilot, or none of draft's, begins; the rest is the training's."""
-
-_CONFIDENCE = 4.0
-"""Standard errors above what the halves tell that an estimated error is believed."""
-
-_CHUNK_PIXELS = 1 << 18
-_PART_PIXELS = 1 << 11
-_SURE = 0.35
-"""Relative standard error of an estimated relMSE up to which it is believed."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +90,7 @@ class Layout:
                 f"pilot {index} {what}"
                 for index in range(self.choices)
                 if index != self.reference
-                for what in ("brightness", *(f"score {radius}" for radius in _SCORE_RADII))
+                for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
             ),
         )
 
@@ -156,6 +125,10 @@ class Evidence:
     def smooth(self) -> Halves:
         """The last of the computed pilots: what errors are relative to."""
         return self.pilots[len(self.layout.pilots)]
+
+    def pilots_at(self, pixels: Indices) -> tuple[Halves, ...]:
+        """Return the pilots at some pixels, shape (pixels, 3)."""
+        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.pilots)
 
     def rows(self, first: int, end: int) -> Evidence:
         """Return what is known of some rows alone."""
@@ -258,7 +231,7 @@ def evidence_from_buffers(
             progress(0.2, "features")
             guides = first_guides(colors, variance, guidance)
             (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
-            image = _unscaled(image, scale)
+            image = unscaled(image, scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
         history = (HistoryPoint(seconds, 0, None),)
@@ -302,7 +275,7 @@ def evidence_from_buffers(
     if previous is not None:
         images.append(filled)
 
-    denominators = _denominators(images[len(described)])
+    denominators = denominators_of(images[len(described)])
     errors = [_errors(pilot, halves, denominators) for pilot in images]
     if layout is None:
         candidate_count = len(images) - 1 - len(described)
@@ -353,7 +326,7 @@ def pilots_of_all_samples(
 
 def with_best_reference(evidence: Evidence) -> Evidence:
     """Return the same evidence with the pilots compared with the one that is best on this image."""
-    denominators = _denominators(evidence.smooth)
+    denominators = denominators_of(evidence.smooth)
     errors = [_errors(pilot, evidence.halves, denominators) for pilot in evidence.pilots]
     layout = replace(evidence.layout, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], evidence.threads)
@@ -372,222 +345,6 @@ def _noises(errors_of_reference: Halves, threads: int) -> Halves:
         for error in errors_of_reference
     )
     return a, b
-
-
-def loss_weights(evidence: Evidence) -> Halves:
-    """Return how much the squared error of each half's pixels counts, shape (height, width, 1).
-
-    Relative to what the half itself says, never to the half that scores it: a pixel must not count less
-    because the noise that it is compared with is bright, or the image would darken.
-    """
-    denominators = _denominators(evidence.smooth)
-    with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
-        weight_a, weight_b = (
-            np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
-            for d, noise in zip(denominators, evidence.noises, strict=True)
-        )
-    return weight_a, weight_b
-
-
-def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
-    """Yield what the network sees of one half, plane by plane, each of shape (height, width).
-
-    A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
-    """
-    threads, layout = evidence.threads, evidence.layout
-    for name in layout.features:
-        yield evidence.features[half][name]
-    noise = evidence.noises[half]
-    yield np.log(noise + np.float32(1e-4))[:, :, 0]
-    base = _log_level(evidence.pilots[layout.reference][half])
-    yield base[:, :, 0]
-
-    other = evidence.halves[1 - half]
-    denominator = _denominators(evidence.smooth)[half]
-    cap = np.float32(_OUTLIER) * noise + np.float32(1e-3)
-    reference = np.minimum(_error(evidence.pilots[layout.reference][half], other, denominator), cap)
-    for index, pilot in enumerate(evidence.pilots):
-        if index == layout.reference:
-            continue
-        shown = pilot[half]
-        if index == 0:
-            # Its own noise aside: else a noisy pixel is chosen for being dark by chance.
-            shown = np.maximum(mean_around(shown, 1, threads), 0)
-        yield np.clip(_log_level(shown) - base, -2, 2)[:, :, 0]
-        worse = np.minimum(_error(pilot[half], other, denominator), cap) - reference
-        for radius in _SCORE_RADII:
-            score = mean_around(worse, radius, threads) / (np.float32(0.05) * noise + np.float32(1e-4))
-            yield np.clip(score, -3, 3)[:, :, 0]
-
-
-def network_inputs(evidence: Evidence) -> Array:
-    """Return the planes of both halves, shape (2, height * width, planes)."""
-    height, width = evidence.halves[0].shape[:2]
-    # Filled plane by plane: this is the largest array of a fit.
-    inputs = np.empty((2, height * width, len(evidence.layout.planes)), np.float32)
-
-    def fill(half: int) -> None:
-        for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
-            column[:] = plane.ravel()
-
-    of_both_halves(fill, evidence.threads)
-    return inputs
-
-
-@dataclass(frozen=True)
-class Standardisation:
-    """What brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
-
-    mean: npt.NDArray[np.float64]
-    std: Array
-
-    def apply(self, inputs: Array) -> None:
-        """Standardise planes in place, shape (halves, pixels, planes), clipped to 4 standard deviations."""
-        for part in _parts(inputs):
-            np.clip(
-                (part - self.mean) / self.std, -LARGEST_INPUT, LARGEST_INPUT, out=part, casting="same_kind"
-            )
-
-
-def standardisation_of(inputs: Array) -> Standardisation:
-    """Return mean and standard deviation of every plane of shape (halves, pixels, planes)."""
-    count = inputs.shape[0] * inputs.shape[1]
-    mean = sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs)) / count
-    variance = sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs)) / count
-    return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
-
-
-def _parts(inputs: Array) -> Iterator[Array]:
-    """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
-    flat = inputs.reshape(-1, inputs.shape[2])
-    for first in range(0, len(flat), _PART_PIXELS):
-        yield flat[first : first + _PART_PIXELS]
-
-
-def pilots_at(evidence: Evidence, pixels: Indices) -> tuple[Halves, ...]:
-    """Return the pilots at some pixels, shape (pixels, 3)."""
-    return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in evidence.pilots)
-
-
-def estimate_error(pilots: Sequence[Halves], scale: float, fused_a: Array, fused_b: Array) -> Array:
-    """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
-
-    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs made of one half each,
-    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
-    is (fused_a - fused_b)^2 / 4 in the mean. Its bias is not known; it is taken for `_BIAS` times the median
-    squared difference of f and the pilots, which blur in different ways, or for less if the noisy halves do
-    not allow as much in the mean (see `_told_by_halves`).
-    """
-    output = np.float32(0.5) * (fused_a + fused_b)
-    epsilon = _epsilon_of_renderer(scale)
-    squared = (fused_a - fused_b) ** 2 / 4
-    variance = np.empty(len(output), np.float32)
-    bias = np.empty(len(output), np.float32)
-    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
-    for first in range(0, len(output), _CHUNK_PIXELS):
-        part = slice(first, first + _CHUNK_PIXELS)
-        relative = 1 / (output[part] ** 2 + epsilon)
-        with np.errstate(over="ignore"):
-            apart = [
-                channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
-                for a, b in computed
-            ]
-            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
-            bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
-    told, standard_error = _told_by_halves(pilots[0], fused_a, fused_b, epsilon)
-    least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
-    allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
-    return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
-
-
-def _epsilon_of_renderer(scale: float) -> np.float32:
-    """0.01 in the renderer's units, squared differences of which are scaled twice; bounded for float32."""
-    return np.float32(min(max(RELMSE_EPSILON * scale**2, 1e-30), 1e30))
-
-
-def _relative(squared: Array, denominator: Array) -> Array:
-    with np.errstate(over="ignore"):
-        relative: Array = np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
-    return relative
-
-
-def held_out_error(pilots: Sequence[Halves], fused_a: Array, fused_b: Array) -> float:
-    """Return the mean of the same error as the other half tells it: without bias, but noisy.
-
-    Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
-    exposure. Told by the noisy halves or, where those leave too large a standard error, by the smallest
-    pilot, far less noisy but a little blurred.
-    """
-    epsilon = np.float32(RELMSE_EPSILON)
-    for witnesses in pilots[:2]:
-        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, epsilon)
-        if standard_error < _SURE * mean:
-            break
-    relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
-    return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
-
-
-def _told_by_halves(
-    witnesses: Halves, fused_a: Array, fused_b: Array, epsilon: np.float32
-) -> tuple[float, float]:
-    """Return the mean error that independent witnesses tell, and its standard error.
-
-    With witnesses a, b of truth x and outputs f_a, f_b made of one half each, E (f_a - b)^2 is the error of
-    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of one
-    output; the mean of two has half of that.
-    """
-    a, b = (image.reshape(-1, 3) for image in witnesses)
-    crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
-    error = channel_mean(_relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
-    spread = float(error.std(dtype=np.float64))
-    return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
-
-
-def result_from_fused(
-    evidence: Evidence,
-    fused: Halves,
-    whole: FloatImage | None,
-    settings: FitSettings,
-    started: float,
-    iterations: int,
-    history: Sequence[HistoryPoint] = (),
-    notes: Sequence[str] = (),
-) -> FitResult:
-    """Make the result of what the network made of each half, or of the input if that is as good.
-
-    ``whole`` is what its weights for both halves, in the mean, make of all samples.
-    """
-    threads = evidence.threads
-    shape = fused[0].shape
-    fused = with_what_was_lost(evidence.halves, fused)
-    fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
-    image = np.float32(0.5) * (fused[0] + fused[1])
-    if whole is not None:
-        image = with_all_samples(fused, whole, threads)
-    error = estimate_error(evidence.pilots, evidence.scale, fused_a, fused_b).reshape(*shape[:2], 1)
-
-    # The error of the plain mean, by the same evidence.
-    half_a, half_b = evidence.halves
-    squared: Array = np.float32(0.25) * (half_a - half_b) ** 2
-    error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
-    notes = [*evidence.notes, *notes]
-    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
-    if told >= error_of_input:
-        notes.append("the input is as good as anything fitted to it, and is returned as it is")
-        image, fused = evidence.mean, evidence.halves
-        epsilon = _epsilon_of_renderer(evidence.scale)
-        error = _relative(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
-    return FitResult(
-        color=_unscaled(image, evidence.scale),
-        settings=settings,
-        seconds=time.perf_counter() - started,
-        iterations=iterations,
-        error=_core.box_mean(error, _ERROR_RADIUS, threads),
-        estimated_relmse=float(error.mean(dtype=np.float64)),
-        halves=(_unscaled(fused[0], evidence.scale), _unscaled(fused[1], evidence.scale)),
-        history=tuple(history),
-        notes=tuple(notes),
-    )
 
 
 def _check_fits(layout: Layout, guidance: Guidance, candidates: int) -> None:
@@ -653,14 +410,15 @@ def _scaled(image: FloatImage, scale: float) -> FloatImage:
     return scaled
 
 
-def _unscaled(image: FloatImage, scale: float) -> FloatImage:
+def unscaled(image: FloatImage, scale: float) -> FloatImage:
+    """Return an image of the evidence in the renderer's units, bounded for float32."""
     largest = float(np.finfo(np.float32).max)
     bounded: FloatImage = np.minimum(image, np.float32(min(largest * scale, largest)))
     bounded /= np.float32(scale)
     return bounded
 
 
-def _denominators(smooth: Halves) -> Halves:
+def denominators_of(smooth: Halves) -> Halves:
     """What squared errors are relative to, per half, shape (height, width, 1)."""
     a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
     return a, b
@@ -668,24 +426,20 @@ def _denominators(smooth: Halves) -> Halves:
 
 def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
     """How well each half's pilot predicts the other half."""
-    a, b = (_error(*images) for images in zip(pilot, halves[::-1], denominators, strict=True))
+    a, b = (squared_error(*images) for images in zip(pilot, halves[::-1], denominators, strict=True))
     return a, b
 
 
-def _error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
+def squared_error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
+    """Return the mean over the channels, relative to a denominator of shape (height, width, 1)."""
     error: FloatImage = channel_mean((image - other) ** 2) / denominator
     return error
 
 
 def _capped(error: FloatImage, threads: int) -> FloatImage:
-    limit = np.float32(_OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
+    limit = np.float32(OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
     capped: FloatImage = np.minimum(error, limit)
     return capped
-
-
-def _log_level(image: FloatImage) -> FloatImage:
-    log_level: FloatImage = np.log(channel_mean(image) + np.float32(_LOG_OFFSET))
-    return log_level
 
 
 def _converged(color: Buffer, scale: float) -> bool:

@@ -1,6 +1,6 @@
 """The presets draft, balanced and final: a small network chooses among pilots, trained across the halves.
 
-The network sees one pixel of one half: its planes (`evidence`). It answers with the weights of a mean of the
+The network sees one pixel of one half: its planes (`planes`). It answers with the weights of a mean of the
 pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". All this is
 linear in the scored half, so noise adds a constant to the loss and nothing to the image: the mean is kept.
 """
@@ -17,14 +17,10 @@ from threading import Event
 import numpy as np
 
 from tungsten_dip.buffers.model import RenderBuffers
-from tungsten_dip.fit.evidence import (
-    Halves,
-    evidence_from_buffers,
-    pilots_of_all_samples,
-    result_from_fused,
-)
+from tungsten_dip.fit.evidence import Halves, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, check_settings, source_sha256
+from tungsten_dip.fit.outcome import result_from_fused
 from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, FOLLOWING_PILOTS, Pilot
 from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings

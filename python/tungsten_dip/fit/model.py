@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import Layout, Standardisation
+from tungsten_dip.fit.evidence import Layout
+from tungsten_dip.fit.planes import Standardisation
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings
 
 Kind = Literal["pointwise", "skip", "resnet"]

@@ -9,21 +9,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from tungsten_dip.fit.evidence import (
+from tungsten_dip.fit.evidence import Array, Evidence, Layout, with_best_reference
+from tungsten_dip.fit.model import Model, Weights
+from tungsten_dip.fit.outcome import estimate_error, held_out_error
+from tungsten_dip.fit.planes import (
     LARGEST_INPUT,
-    Array,
-    Evidence,
-    Layout,
     Standardisation,
-    estimate_error,
-    held_out_error,
     loss_weights,
     network_inputs,
-    pilots_at,
     standardisation_of,
-    with_best_reference,
 )
-from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE, Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
@@ -151,7 +146,7 @@ def train(
     order = rng.permutation(pixels)
     held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
     probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
-    pilots = pilots_at(start.evidence, probe)
+    pilots = start.evidence.pilots_at(probe)
     done = Training(notes=list(start.notes))
 
     def estimate(step: int) -> tuple[float, float]:

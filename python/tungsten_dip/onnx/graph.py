@@ -14,8 +14,8 @@ import onnx
 from onnx import TensorProto
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import LARGEST_INPUT
 from tungsten_dip.fit.model import Model, Weights
+from tungsten_dip.fit.planes import LARGEST_INPUT
 from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE
 from tungsten_dip.graphs.builder import GraphBuilder
 

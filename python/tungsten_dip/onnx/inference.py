@@ -13,7 +13,6 @@ from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import (
-    PLANES_RADIUS,
     Array,
     Evidence,
     Halves,
@@ -21,13 +20,13 @@ from tungsten_dip.fit.evidence import (
     checked_previous,
     evidence_from_buffers,
     pilots_of_all_samples,
-    planes_of_half,
-    result_from_fused,
 )
 from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
+from tungsten_dip.fit.outcome import result_from_fused
+from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of

@@ -1,0 +1,152 @@
+"""What becomes of a network's output: the image, its error, and whether it is better than its input."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.fit.all_samples import with_all_samples
+from tungsten_dip.fit.evidence import Array, Evidence, Halves, unscaled
+from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.yielding import with_what_was_lost
+
+_ERROR_RADIUS = 4
+_CHUNK_PIXELS = 1 << 18
+_BIAS = 1.5
+"""What the squared bias is to the median squared difference of the pilots from the result, about."""
+
+_CONFIDENCE = 4.0
+"""Standard errors above what the halves tell that an estimated error is believed."""
+
+_SURE = 0.35
+"""Relative standard error of an estimated relMSE up to which it is believed."""
+
+_LARGEST_ERROR = 1e30
+"""Larger relative squared errors count as this large: their sums overflow."""
+
+
+def estimate_error(pilots: Sequence[Halves], scale: float, fused_a: Array, fused_b: Array) -> Array:
+    """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
+
+    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs made of one half each,
+    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
+    is (fused_a - fused_b)^2 / 4 in the mean. Its bias is not known; it is taken for `_BIAS` times the median
+    squared difference of f and the pilots, which blur in different ways, or for less if the noisy halves do
+    not allow as much in the mean (see `_told_by_halves`).
+    """
+    output = np.float32(0.5) * (fused_a + fused_b)
+    epsilon = _epsilon_of_renderer(scale)
+    squared = (fused_a - fused_b) ** 2 / 4
+    variance = np.empty(len(output), np.float32)
+    bias = np.empty(len(output), np.float32)
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
+    for first in range(0, len(output), _CHUNK_PIXELS):
+        part = slice(first, first + _CHUNK_PIXELS)
+        relative = 1 / (output[part] ** 2 + epsilon)
+        with np.errstate(over="ignore"):
+            apart = [
+                channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
+                for a, b in computed
+            ]
+            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
+            bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
+    told, standard_error = _told_by_halves(pilots[0], fused_a, fused_b, epsilon)
+    least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
+    allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
+    return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
+
+
+def _epsilon_of_renderer(scale: float) -> np.float32:
+    """0.01 in the renderer's units, squared differences of which are scaled twice; bounded for float32."""
+    return np.float32(min(max(RELMSE_EPSILON * scale**2, 1e-30), 1e30))
+
+
+def _relative(squared: Array, denominator: Array) -> Array:
+    with np.errstate(over="ignore"):
+        relative: Array = np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
+    return relative
+
+
+def held_out_error(pilots: Sequence[Halves], fused_a: Array, fused_b: Array) -> float:
+    """Return the mean of the same error as the other half tells it: without bias, but noisy.
+
+    Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
+    exposure. Told by the noisy halves or, where those leave too large a standard error, by the smallest
+    pilot, far less noisy but a little blurred.
+    """
+    epsilon = np.float32(RELMSE_EPSILON)
+    for witnesses in pilots[:2]:
+        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, epsilon)
+        if standard_error < _SURE * mean:
+            break
+    relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
+    return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
+
+
+def _told_by_halves(
+    witnesses: Halves, fused_a: Array, fused_b: Array, epsilon: np.float32
+) -> tuple[float, float]:
+    """Return the mean error that independent witnesses tell, and its standard error.
+
+    With witnesses a, b of truth x and outputs f_a, f_b made of one half each, E (f_a - b)^2 is the error of
+    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of one
+    output; the mean of two has half of that.
+    """
+    a, b = (image.reshape(-1, 3) for image in witnesses)
+    crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
+    error = channel_mean(_relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
+    spread = float(error.std(dtype=np.float64))
+    return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
+
+
+def result_from_fused(
+    evidence: Evidence,
+    fused: Halves,
+    whole: FloatImage | None,
+    settings: FitSettings,
+    started: float,
+    iterations: int,
+    history: Sequence[HistoryPoint] = (),
+    notes: Sequence[str] = (),
+) -> FitResult:
+    """Make the result of what the network made of each half, or of the input if that is as good.
+
+    ``whole`` is what its weights for both halves, in the mean, make of all samples.
+    """
+    threads = evidence.threads
+    shape = fused[0].shape
+    fused = with_what_was_lost(evidence.halves, fused)
+    fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
+    image = np.float32(0.5) * (fused[0] + fused[1])
+    if whole is not None:
+        image = with_all_samples(fused, whole, threads)
+    error = estimate_error(evidence.pilots, evidence.scale, fused_a, fused_b).reshape(*shape[:2], 1)
+
+    # The error of the plain mean, by the same evidence.
+    half_a, half_b = evidence.halves
+    squared: Array = np.float32(0.25) * (half_a - half_b) ** 2
+    error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
+    notes = [*evidence.notes, *notes]
+    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
+    if told >= error_of_input:
+        notes.append("the input is as good as anything fitted to it, and is returned as it is")
+        image, fused = evidence.mean, evidence.halves
+        epsilon = _epsilon_of_renderer(evidence.scale)
+        error = _relative(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
+    return FitResult(
+        color=unscaled(image, evidence.scale),
+        settings=settings,
+        seconds=time.perf_counter() - started,
+        iterations=iterations,
+        error=_core.box_mean(error, _ERROR_RADIUS, threads),
+        estimated_relmse=float(error.mean(dtype=np.float64)),
+        halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
+        history=tuple(history),
+        notes=tuple(notes),
+    )

@@ -1,0 +1,133 @@
+"""What the network of the presets draft, balanced and final sees of an image, and how much its pixels count.
+
+Planes say of every pixel what its features are, what the pilots say, and how well each pilot of one half
+predicts the other half in the pixels around it: never in the pixel itself, whose noise it is scored by (the
+blind spot of Krull et al. 2019, "Noise2Void"). The scores of two neighbours together tell that noise all the
+same, which is why the network sees one pixel at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.fit.evidence import (
+    OUTLIER,
+    SCORE_RADII,
+    Array,
+    Evidence,
+    Halves,
+    denominators_of,
+    squared_error,
+)
+from tungsten_dip.fit.halves import of_both_halves
+from tungsten_dip.fit.neighbours import mean_around
+
+PLANES_RADIUS = max(SCORE_RADII)
+LARGEST_INPUT = 4.0
+
+_LOG_OFFSET = 0.02
+_LEAST_SPREAD = 1e-6
+_PART_PIXELS = 1 << 11
+_LEAST_NOISE = 1.0
+"""Relative variance of one half's pixel below which less noise does not make a pixel count more."""
+
+
+def loss_weights(evidence: Evidence) -> Halves:
+    """Return how much the squared error of each half's pixels counts, shape (height, width, 1).
+
+    Relative to what the half itself says, never to the half that scores it: a pixel must not count less
+    because the noise that it is compared with is bright, or the image would darken.
+    """
+    denominators = denominators_of(evidence.smooth)
+    with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
+        weight_a, weight_b = (
+            np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
+            for d, noise in zip(denominators, evidence.noises, strict=True)
+        )
+    return weight_a, weight_b
+
+
+def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
+    """Yield what the network sees of one half, plane by plane, each of shape (height, width).
+
+    A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
+    """
+    threads, layout = evidence.threads, evidence.layout
+    for name in layout.features:
+        yield evidence.features[half][name]
+    noise = evidence.noises[half]
+    yield np.log(noise + np.float32(1e-4))[:, :, 0]
+    base = _log_level(evidence.pilots[layout.reference][half])
+    yield base[:, :, 0]
+
+    other = evidence.halves[1 - half]
+    denominator = denominators_of(evidence.smooth)[half]
+    cap = np.float32(OUTLIER) * noise + np.float32(1e-3)
+    reference = np.minimum(squared_error(evidence.pilots[layout.reference][half], other, denominator), cap)
+    for index, pilot in enumerate(evidence.pilots):
+        if index == layout.reference:
+            continue
+        shown = pilot[half]
+        if index == 0:
+            # Its own noise aside: else a noisy pixel is chosen for being dark by chance.
+            shown = np.maximum(mean_around(shown, 1, threads), 0)
+        yield np.clip(_log_level(shown) - base, -2, 2)[:, :, 0]
+        worse = np.minimum(squared_error(pilot[half], other, denominator), cap) - reference
+        for radius in SCORE_RADII:
+            score = mean_around(worse, radius, threads) / (np.float32(0.05) * noise + np.float32(1e-4))
+            yield np.clip(score, -3, 3)[:, :, 0]
+
+
+def network_inputs(evidence: Evidence) -> Array:
+    """Return the planes of both halves, shape (2, height * width, planes)."""
+    height, width = evidence.halves[0].shape[:2]
+    # Filled plane by plane: this is the largest array of a fit.
+    inputs = np.empty((2, height * width, len(evidence.layout.planes)), np.float32)
+
+    def fill(half: int) -> None:
+        for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
+            column[:] = plane.ravel()
+
+    of_both_halves(fill, evidence.threads)
+    return inputs
+
+
+@dataclass(frozen=True)
+class Standardisation:
+    """What brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
+
+    mean: npt.NDArray[np.float64]
+    std: Array
+
+    def apply(self, inputs: Array) -> None:
+        """Standardise planes in place, shape (halves, pixels, planes), clipped to 4 standard deviations."""
+        for part in _parts(inputs):
+            np.clip(
+                (part - self.mean) / self.std, -LARGEST_INPUT, LARGEST_INPUT, out=part, casting="same_kind"
+            )
+
+
+def standardisation_of(inputs: Array) -> Standardisation:
+    """Return mean and standard deviation of every plane of shape (halves, pixels, planes)."""
+    count = inputs.shape[0] * inputs.shape[1]
+    mean = sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs)) / count
+    variance = sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs)) / count
+    return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
+
+
+def _parts(inputs: Array) -> Iterator[Array]:
+    """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
+    flat = inputs.reshape(-1, inputs.shape[2])
+    for first in range(0, len(flat), _PART_PIXELS):
+        yield flat[first : first + _PART_PIXELS]
+
+
+def _log_level(image: FloatImage) -> FloatImage:
+    log_level: FloatImage = np.log(channel_mean(image) + np.float32(_LOG_OFFSET))
+    return log_level
