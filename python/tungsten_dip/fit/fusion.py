@@ -32,14 +32,20 @@ _LARGE_RADIUS = 18
 """Windows of a larger radius are left out where they would cover the whole image."""
 
 
+_BATCH_PIXELS = 1 << 14
+_SMALL_BATCH_PIXELS = 1 << 13
+"""Enough for the pilots of draft; with more of them the rims of lamps, few pixels, come out worse."""
+
+
 @dataclass(frozen=True)
 class _Preset:
     pilots: tuple[Pilot, ...]
     steps: int
+    batch_pixels: int = _BATCH_PIXELS
 
 
 _PRESETS = {
-    "draft": _Preset(DRAFT_PILOTS, 80),
+    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS),
     "balanced": _Preset(BALANCED_PILOTS, 240),
     "final": _Preset(FINAL_PILOTS, 240),
 }
@@ -59,7 +65,9 @@ def fit_fusion(
     preset = _PRESETS[settings.preset]
     if warm_start is not None:
         check_settings(warm_start, settings)
-    pilots = preset.pilots if previous is None else FOLLOWING_PILOTS
+    if previous is not None:
+        preset = _Preset(FOLLOWING_PILOTS, preset.steps)
+    pilots = preset.pilots
     # One model of first order cannot stand for a whole image.
     largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)
     pilots = tuple(pilot for pilot in pilots if pilot.radius <= largest)
@@ -86,7 +94,8 @@ def fit_fusion(
         )
         if threads == 1:
             wait([whole_pilots])
-        training = train(network, start, settings, settings.iterations or preset.steps, started, progress)
+        steps = settings.iterations or preset.steps
+        training = train(network, start, settings, steps, preset.batch_pixels, started, progress)
         if training.interrupted:
             given_up.set()
         images = whole_pilots.result()

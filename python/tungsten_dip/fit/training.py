@@ -27,7 +27,6 @@ LEARNING_RATE = 1e-2
 _HEAD_START = 1.0
 """Logit that the best single pilot starts with."""
 
-BATCH_PIXELS = 1 << 14
 _WARM_UP_STEPS = 10
 _HISTORY_EVERY = 20
 _PROBE_PIXELS = 1 << 15
@@ -133,10 +132,13 @@ def train(
     start: Start,
     settings: FitSettings,
     steps: int,
+    batch_pixels: int,
     started: float,
     progress: Progress,
 ) -> Training:
     """Train for ``steps`` steps, or fewer: within the time budget, to the target error, until Ctrl-C.
+
+    Every step is made on ``batch_pixels`` pixels drawn at random.
 
     After a warm start, the network is done once the error of pixels that are not trained on, as the halves
     tell it, falls no further.
@@ -167,7 +169,7 @@ def train(
             # What the learning rate anneals over is what ends first: the steps or the budget.
             gone = max((step - 1) / steps, min((time.perf_counter() - begun) / left_s, 1.0))
             rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * gone)
-            batch = rng.integers(2 * len(trained), size=min(BATCH_PIXELS, 2 * len(trained)))
+            batch = rng.integers(2 * len(trained), size=min(batch_pixels, 2 * len(trained)))
             network.step(batch // len(trained), trained[batch % len(trained)], LEARNING_RATE * rate)
             done.steps_done = step
             if step % every != 0 and step != steps and step != 1:
