@@ -26,7 +26,8 @@ class Environments final : public Emitter<Float, Spectrum> {
         for (size_t i = 0; props.has_property("light_" + std::to_string(i)); ++i) {
             auto nested = props.get<ref<Object>>("light_" + std::to_string(i));
             auto* emitter = dynamic_cast<Base*>(nested.get());
-            if (emitter == nullptr || !emitter->is_environment()) Throw("Expected emitters that surround the scene");
+            if (emitter == nullptr || !emitter->is_environment())
+                Throw("Expected emitters that surround the scene");
             m_lights.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false)});
         }
         if (m_lights.empty()) Throw("Expected nested emitters");
