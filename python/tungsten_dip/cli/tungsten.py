@@ -207,11 +207,13 @@ def _render_scene(
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
                 preview = _preview(outputs, settings) if options.dip_preview else None
+                before = _last_written(outputs.hdr)
                 rendered = tungsten_host.drive(path, _driver_options(options), preview, progress)
                 buffers = rendered.buffers
                 left = SceneOutputs(
                     ldr=None if rendered.output_file else outputs.ldr,
-                    hdr=None if rendered.hdr_output_file else outputs.hdr,
+                    # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
+                    hdr=None if _last_written(outputs.hdr) != before else outputs.hdr,
                 )
             else:
                 buffers = _render_with_mitsuba(scene, options, progress)
@@ -230,6 +232,11 @@ def _render_scene(
                 options.save_model,
                 None if follower is None else partial(_follow, follower, scene.camera),
             )
+
+
+def _last_written(path: Path | None) -> int | None:
+    """Return the time of a file's last change in nanoseconds, None where there is no file."""
+    return path.stat().st_mtime_ns if path is not None and path.exists() else None
 
 
 def _follow(follower: Follower, camera: Camera, buffers: RenderBuffers) -> FitResult:
