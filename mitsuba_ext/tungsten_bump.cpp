@@ -4,7 +4,9 @@
 //   (nested)   the BSDF
 //   slopes     texture of three channels: what the height gains from the texel on the left of a place to the
 //              one on its right, and from the one above to the one below; the third is not used
-//   unit       bool: tangents are of length 1 (on meshes and cubes), not as long as the edges (on quads)
+//   shape      mesh, cube or quad: which tangents Tungsten bends
+#include <string>
+
 #include "tungsten_bsdf.hpp"
 
 namespace mitsuba {
@@ -20,7 +22,11 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
             if (auto* bsdf = prop.try_get<BSDF>()) m_nested = bsdf;
         if (!m_nested) Throw("Expected a nested BSDF on the bent surface");
         m_slopes = props.get_texture<Texture>("slopes", 0.f);
-        m_unit = props.get<bool>("unit", true);
+        const auto shape = props.get<std::string>("shape");
+        if (shape != "mesh" && shape != "cube" && shape != "quad")
+            Throw("Expected the shape mesh, cube or quad, got \"%s\"", shape);
+        m_unit = shape != "quad";
+        m_mirrors = shape == "mesh";
         for (size_t i = 0; i < m_nested->component_count(); ++i) Base::add_component(m_nested->flags(i));
     }
 
@@ -51,10 +57,12 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
         Vector3f tangent = si.dp_du;
         Vector3f bitangent = si.dp_dv;
         if (m_unit) {
-            // Tungsten's tangents point the other way where the texture is mirrored.
-            const float side = dr::dot(dr::cross(tangent, bitangent), Vector3f(si.n)) < 0.f ? -1.f : 1.f;
-            tangent = side * dr::normalize(tangent);
-            bitangent = side * dr::normalize(bitangent);
+            tangent = dr::normalize(tangent);
+            bitangent = dr::normalize(bitangent);
+        }
+        if (m_mirrors && dr::dot(dr::cross(tangent, bitangent), Vector3f(si.n)) < 0.f) {
+            tangent = -tangent;
+            bitangent = -bitangent;
         }
         const Color3f slope = m_slopes->eval_3(si, true);
         tangent += n * (slope.x() - dr::dot(n, tangent));
@@ -74,7 +82,8 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
 
     ref<BSDF> m_nested;
     ref<Texture> m_slopes;
-    bool m_unit;
+    bool m_unit;     // tangents have length 1, not that of the quad's edges
+    bool m_mirrors;  // tangents point the other way where the texture is mirrored
 };
 
 }  // namespace mitsuba

@@ -140,7 +140,7 @@ def bumpy() -> dict[str, Any]:
             bsdf["bump"] = bump
     scene["primitives"][3] |= {
         "type": "cube",
-        "transform": {"position": [0.5, 0.5, 0], "rotation": [0, 30, 0]},
+        "transform": {"position": [0.5, 0.5, 0], "rotation": [150, 30, 200]},
     }
     return scene
 

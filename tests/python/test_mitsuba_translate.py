@@ -567,6 +567,27 @@ def test_height_map_turns_the_normal_by_differences_of_texels(
     assert means[1] / means[0] == pytest.approx(math.sqrt(0.5), rel=1e-3)
 
 
+@pytest.mark.parametrize("turn", [0, 180])
+def test_height_map_bends_opposite_faces_of_a_cube_alike(turn: int, tmp_path: Path) -> None:
+    # Heights rise along the cube's own z, so that normals lean towards -z on the faces of +y and -y.
+    write_slope(tmp_path)
+    camera = {"transform": {"position": [1, 5, 0.01], "look_at": [1, 0, 0], "up": [0, 0, 1]}, "fov": 10}
+    direct = {"type": "path_tracer", "max_bounces": 2}
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 1 / (2 * TEXEL_STEP)}
+    place = {"scale": [8, 8, 8], "position": [0, -4, 0], "rotation": [0, 0, turn]}
+    cube = {"type": "cube", "transform": place, "bsdf": {**GREY, "bump": bump}}
+    towards, away = (
+        render(
+            tmp_path,
+            [cube, {"type": "point", "transform": {"position": [0, 9000, z]}, "power": 1e8}],
+            camera,
+            integrator=direct,
+        ).color.mean
+        for z in (-5000, 5000)
+    )
+    assert (towards > 2 * away).all()
+
+
 def test_height_map_leaves_triangles_without_area_in_uv_flat(folder: Path) -> None:
     (folder / "plate.obj").write_text("v -4 0 -4\nv 4 0 -4\nv 4 0 4\nvt 0 0\nf 1/1 3/1 2/1\n")
     camera = {"transform": {"position": [1, 5, -1], "look_at": [1, 0, -1.01], "up": [0, 0, 1]}, "fov": 10}

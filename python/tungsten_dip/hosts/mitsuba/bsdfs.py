@@ -21,8 +21,8 @@ _EUMELANIN = (0.419, 0.697, 1.37)
 _PHEOMELANIN = (0.187, 0.4, 1.05)
 
 
-Tangents = Literal["unit", "edges"]
-"""How long the tangents are that a height map bends: 1, or as long as the edges of the shape."""
+BentShape = Literal["mesh", "cube", "quad"]
+"""The shapes whose tangents, which a height map bends, are known to "tungsten_bump"."""
 
 
 def bsdf_object(
@@ -30,41 +30,41 @@ def bsdf_object(
     bsdf: ts.Bsdf,
     uv: Matrix = UV,
     *,
-    tangents: Tangents | None = None,
+    shape: BentShape | None = None,
     faces_viewer: bool = False,
 ) -> Any:
     """Return the Mitsuba BSDF for a surface with this parameterisation, and note its albedo texture.
 
-    ``tangents`` are those of Tungsten's shape, None where ours has others. ``faces_viewer`` is for hair on
+    ``shape`` is what carries it, None for others than a height map can bend. ``faces_viewer`` is for hair on
     curves whose normal Tungsten turns towards the viewer.
 
     Raises InputError for what has no counterpart.
     """
-    bent = has_slopes(bsdf)
-    key = ("bsdf", bsdf, uv.tobytes().hex(), tangents if bent else None, faces_viewer)
+    heights = height_map(bsdf)
+    key = ("bsdf", bsdf, uv.tobytes().hex(), None if heights is None else shape, faces_viewer)
     found = t.made(key)
     if found is not None:
         return found
     outer, t.place = t.place, f"{t.place}, {_named(bsdf)}" if t.place else _named(bsdf)
     node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(t, bsdf, uv)
-    if bsdf.bump is not None and bent:
-        if tangents is None:
+    if heights is not None:
+        if shape is None:
             raise t.unsupported("bump mapping of another shape than a mesh, a quad or a cube")
         if t.source.integrator.enable_consistency_checks:
             raise t.unsupported("bump mapping with enable_consistency_checks")
-        slopes = slopes_node(t, bsdf.bump, uv)
+        slopes = slopes_node(t, heights, uv)
         # Outside of "twosided": Tungsten turns the bent normal towards the viewer.
-        node = {"type": "tungsten_bump", "nested": node, "slopes": slopes, "unit": tangents == "unit"}
+        node = {"type": "tungsten_bump", "nested": node, "slopes": slopes, "shape": shape}
     built = t.add_object("bsdf", node)
     t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
     t.place = outer
     return t.remember(key, built)
 
 
-def has_slopes(bsdf: ts.Bsdf) -> bool:
-    """Whether a height map bends the surface: of all textures Tungsten knows the slopes of bitmaps alone."""
+def height_map(bsdf: ts.Bsdf) -> ts.Texture | None:
+    """Return what bends the surface, if anything does: Tungsten knows the slopes of bitmaps alone."""
     flat = ts.ConstantTexture | ts.CheckerTexture | ts.DiskTexture | ts.BladeTexture
-    return bsdf.bump is not None and not isinstance(bsdf.bump, flat)
+    return None if isinstance(bsdf.bump, flat) else bsdf.bump
 
 
 def _named(bsdf: ts.Bsdf) -> str:

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.hosts.mitsuba.bsdfs import Tangents, bsdf_object, has_slopes
+from tungsten_dip.hosts.mitsuba.bsdfs import BentShape, bsdf_object, height_map
 from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
 from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, largest_value, texture_node
@@ -33,7 +33,7 @@ _DISK_UV = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _CYLINDER_UV = np.array([[-1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-_TANGENTS: dict[type[ts.Primitive], Tangents] = {ts.Mesh: "unit", ts.Cube: "unit", ts.Quad: "edges"}
+_BENT_SHAPES: dict[type[ts.Primitive], BentShape] = {ts.Mesh: "mesh", ts.Cube: "cube", ts.Quad: "quad"}
 
 _LEAST_UV_AREA = 1e-6
 """Twice the area in UV of a triangle below which Tungsten knows no tangents of it."""
@@ -86,7 +86,7 @@ def emission_node(t: Translation, primitive: ts.Primitive, area: float, uv: Matr
 
 def _surroundings(t: Translation, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
     """What a shape needs beside its geometry and its light: its BSDF and media."""
-    surface = bsdf_object(t, bsdf, uv, tangents=_TANGENTS.get(type(primitive)))
+    surface = bsdf_object(t, bsdf, uv, shape=_BENT_SHAPES.get(type(primitive)))
     node: Node = {surface.id(): surface}  # Mitsuba renames what it finds under another name
     if primitive.int_medium is not None:
         node["interior"] = medium_object(t, primitive.int_medium)
@@ -110,12 +110,11 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     emission = emission_node(t, primitive, area)
     materials = np.clip(mesh.materials, 0, len(primitive.bsdf) - 1)
     parts = [(bsdf, materials == number) for number, bsdf in enumerate(primitive.bsdf)]
-    if any(has_slopes(bsdf) for bsdf in primitive.bsdf):
+    if any(height_map(bsdf) for bsdf in primitive.bsdf):
         first, second = (mesh.uvs[mesh.triangles[:, i]] - mesh.uvs[mesh.triangles[:, 0]] for i in (1, 2))
         flat = abs(first[:, 0] * second[:, 1] - second[:, 0] * first[:, 1]) < _LEAST_UV_AREA
-        bare = [(replace(bsdf, bump=None), part & flat) for bsdf, part in parts if has_slopes(bsdf)]
-        bent = [(bsdf, part & ~flat if has_slopes(bsdf) else part) for bsdf, part in parts]
-        parts = [*bent, *bare]
+        bare = [(replace(bsdf, bump=None), part & flat) for bsdf, part in parts]
+        parts = [*((bsdf, part & ~flat) for bsdf, part in parts), *bare]
     return [
         _triangles(
             t,
