@@ -15,9 +15,9 @@ import numpy as np
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, fusion
-from tungsten_dip.fit.evidence import Evidence, Indices
+from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pointwise import PointwiseNetwork
+from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import Start, start_of_training
 from tungsten_dip.report.metrics import compare
@@ -34,12 +34,13 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
     class Watched(PointwiseNetwork):
         steps = 0
 
-        def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
-            super().step(half, pixel, learning_rate)
+        def step(self, batch: Examples, learning_rate: float) -> None:
+            super().step(batch, learning_rate)
             self.steps += 1
             if self.steps % EVERY == 0:
-                evidence = starts[-1].evidence
-                image = np.float32(0.5 / evidence.scale) * (self.fuse_all(0) + self.fuse_all(1))
+                evidence, examples = starts[-1].evidence, starts[-1].examples
+                of_halves = [self.fuse(examples.of_half(half)) for half in (0, 1)]
+                image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])
                 found.append(compare(image.reshape(evidence.mean.shape), bench_set.reference).psnr)
 
     def start(evidence: Evidence, seed: int, model: Model | None = None) -> Start:

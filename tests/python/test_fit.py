@@ -11,7 +11,7 @@ import pytest
 from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion
+from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -22,6 +22,8 @@ from tungsten_dip.fit.pilots import (
     first_guides,
     guidance_of_halves,
 )
+from tungsten_dip.fit.pointwise import Examples
+from tungsten_dip.fit.training import _batches
 
 
 def _settings(**changes: Any) -> FitSettings:
@@ -549,3 +551,22 @@ def test_a_previous_frame_of_another_size_is_refused(render):
     wrong = np.zeros((3, 4, 3), np.float32)
     with pytest.raises(InputError, match="previous, half A: expected shape"):
         denoise(render.buffers, FitSettings(preset="draft"), previous=(wrong, wrong))
+
+
+@pytest.mark.parametrize(("pixels", "size"), [(1, 16), (10, 4), (10, 7), (50, 1000)])
+def test_batches_show_all_that_is_trained_on_and_nothing_else(
+    pixels: int, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "_POOL_PIXELS", 12)
+    numbers = np.arange(2 * pixels, dtype=np.float32)[:, None]
+    examples = Examples(numbers, numbers[:, :, None], numbers, numbers)
+    trained = np.arange(0, pixels, 2)
+    batches = _batches(examples, trained, size, np.random.default_rng(0))
+    seen: set[float] = set()
+    for _ in range(200):
+        batch = next(batches)
+        assert len(batch.inputs) == min(size, 12, 2 * len(trained))
+        assert len(set(batch.inputs.ravel())) == len(batch.inputs)
+        np.testing.assert_array_equal(batch.wanted, batch.inputs)
+        seen |= set(batch.inputs.ravel().tolist())
+    assert seen == {*trained, *(pixels + trained)}

@@ -137,12 +137,12 @@ def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, in
     assert color.shape == (2, 3, height, width)
 
     flat = inputs.reshape(2, len(model.planes), -1).transpose(0, 2, 1).copy()
-    model.standardisation.apply(flat)
+    model.standardisation.apply(flat, threads=1)
     choices = pilots.reshape(2, model.layout.choices, 3, -1).transpose(0, 3, 1, 2).copy()
-    examples = Examples(flat, choices, choices[:, :, 0], flat[:, :, :1])
-    network = TorchNetwork(model.weights, examples)
+    network = TorchNetwork(model.weights)
     for half in (0, 1):
-        expected = network.fuse(half, slice(None)).T.reshape(3, height, width)
+        examples = Examples(flat[half], choices[half], choices[half, :, 0], flat[half, :, :1])
+        expected = network.fuse(examples).T.reshape(3, height, width)
         np.testing.assert_allclose(color[half], expected, rtol=1e-4)
 
 
@@ -201,24 +201,24 @@ def test_a_plane_that_varies_little_around_a_large_mean_keeps_its_digits() -> No
     layout = Layout(("depth.Z",), (Pilot(1),), 0, 1)
     planes = len(layout.planes)
     rng = np.random.default_rng(0)
-    raw = np.full((1, planes, 6, 7), 1e4, np.float32)
+    raw = np.full((2, planes, 6, 7), 1e4, np.float32)
     raw += rng.integers(-9, 9, raw.shape).astype(np.float32) / 256
-    flat = raw.reshape(1, planes, -1).transpose(0, 2, 1).copy()
+    flat = raw.reshape(2, planes, -1).transpose(0, 2, 1).copy()
     mean = np.full(planes, 1e4 + 1e-5)
     standardisation = Standardisation(mean, np.full(planes, 0.02, np.float32))
     weights = first_weights(layout, 0)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
     fit = Model("pointwise", layout.planes, weights, FitSettings(), None, "", layout, standardisation)
-    pilots = rng.random((1, 2, 3, 6, 7), np.float32)
+    pilots = rng.random((2, 2, 3, 6, 7), np.float32)
     color = session_of(fit).run(None, {"inputs": raw, "pilots": pilots})[0]
-    standardisation.apply(flat)
-    x = flat[0].astype(np.float64)
+    standardisation.apply(flat, threads=1)
+    x = flat.astype(np.float64)
     for layer in (1, 2, 3):
         x = x @ weights[f"layer{layer}.weight"][:, :, 0, 0].T + weights[f"layer{layer}.bias"]
         x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
-    shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
-    expected = np.einsum("ps,scp->cp", shares, pilots.reshape(2, 3, -1))
-    np.testing.assert_allclose(color.reshape(3, -1), expected, rtol=1e-5)
+    shares = np.exp(x) / np.exp(x).sum(2, keepdims=True)
+    expected = np.einsum("hps,hscp->hcp", shares, pilots.reshape(2, 2, 3, -1))
+    np.testing.assert_allclose(color.reshape(2, 3, -1), expected, rtol=1e-5)
 
 
 def test_bands_make_no_difference(
@@ -779,18 +779,18 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     rng = np.random.default_rng(4)
     for name, value in weights.items():
         weights[name] = value + rng.normal(0, 0.3, value.shape).astype(np.float32)
-    half, pixel = rng.integers(2, size=pixels), rng.integers(480, size=pixels)
+    batch = examples.at(rng.integers(2 * 480, size=pixels))
 
-    in_torch = TorchNetwork(weights, examples)
-    in_onnx = PointwiseNetwork(weights, examples)
+    in_torch = TorchNetwork(weights)
+    in_onnx = PointwiseNetwork(weights, len(layout.planes), layout.choices)
     proto = training_step(len(layout.planes), layout.choices)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
     feeds = {
-        "inputs": examples.inputs[half, pixel],
-        "choices": examples.choices[half, pixel],
-        "wanted": examples.wanted[half, pixel],
-        "weight": examples.weight[half, pixel],
+        "inputs": batch.inputs,
+        "choices": batch.choices,
+        "wanted": batch.wanted,
+        "weight": batch.weight,
         "weights": vector,
         "mean": np.zeros_like(vector),
         "square": np.zeros_like(vector),
@@ -799,16 +799,14 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     }
     gradient, loss = session_from_proto(proto, 1).run(["gradient", "loss"], feeds)
 
-    expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(half, pixel)])
+    expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(batch)])
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    both = np.stack([in_onnx.fuse_all(0), in_onnx.fuse_all(1)])
-    fused = both[half, pixel]
-    squared = (fused - feeds["wanted"]) ** 2 * feeds["weight"]
+    squared = (in_onnx.fuse(batch) - batch.wanted) ** 2 * batch.weight
     assert loss == pytest.approx(squared.mean(), rel=1e-4)
 
     for _ in range(5):
         for network in (in_torch, in_onnx):
-            network.step(half, pixel, 1e-2)
+            network.step(batch, 1e-2)
     for name, value in in_torch.weights().items():
         np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-4, atol=1e-4)
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +74,11 @@ def read_image(path: str | Path) -> FloatImage:
     return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
 
 
-def write_exr(path: Path, parts: Iterable[Part]) -> None:
+def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> None:
     """Write the parts, every channel in its own pixel type, compressed without loss, whole or not at all.
 
-    Attributes that EXR cannot hold are left out and logged. Raises InputError if the file cannot be written.
+    ``threads`` None compresses on every core. Attributes that EXR cannot hold are left out and logged. Raises
+    InputError if the file cannot be written.
     """
     encoded = []
     for part in parts:
@@ -84,8 +87,23 @@ def write_exr(path: Path, parts: Iterable[Part]) -> None:
         # OpenEXR turns the values of the dictionary it is given into objects of its own, hence the copy.
         channels = {name: np.ascontiguousarray(channel) for name, channel in part.channels.items()}
         encoded.append(OpenEXR.Part(header, channels, part.name))
-    with replacing(path) as temporary, temporary.open("wb") as stream:
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as stream,
+        _compressing(threads or os.cpu_count() or 1),
+    ):
         OpenEXR.File(encoded).write(stream)
+
+
+@contextmanager
+def _compressing(threads: int) -> Iterator[None]:
+    """Let OpenEXR use so many threads, for as long as it is needed: a process that forks must have none."""
+    before = OpenEXR.global_thread_count()
+    OpenEXR.set_global_thread_count(threads)
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(before)
 
 
 def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:

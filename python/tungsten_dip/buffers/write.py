@@ -50,7 +50,7 @@ class Denoised(Protocol):
 
     @property
     def settings(self) -> Any:
-        """A dataclass with a field ``seed``."""
+        """A dataclass with fields ``seed`` and ``threads``."""
 
     @property
     def seconds(self) -> float:
@@ -101,9 +101,10 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, h
     own |= _spp(buffers)
     attributes = {**_frame(source), **buffers.attributes, **own}
     if single:
-        write_exr(Path(path), [Part(added | kept, attributes, source.parts[0].name)])
+        parts = [Part(added | kept, attributes, source.parts[0].name)]
     else:
-        write_exr(Path(path), [Part(added, attributes, _DENOISED_PART), *source.parts])
+        parts = [Part(added, attributes, _DENOISED_PART), *source.parts]
+    write_exr(Path(path), parts, result.settings.threads)
 
 
 def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:

@@ -81,13 +81,15 @@ def fit_fusion(
         return evidence
     start = start_of_training(evidence, settings.seed, warm_start)
     evidence = start.evidence
-    network = PointwiseNetwork(start.weights, start.examples, settings.device)
+    network = PointwiseNetwork(
+        start.weights, len(evidence.layout.planes), evidence.layout.choices, settings.device
+    )
     given_up = Event()
-    # One core trains the network; meanwhile the others make the pilots of all samples.
+    # The network keeps one core busy; the pilots of all samples take what is left of all of them.
     with ThreadPoolExecutor(1) as beside:
         whole_pilots = beside.submit(
             lambda: (
-                pilots_of_all_samples(evidence, buffers, settings, started, max(threads - 1, 1), given_up)
+                pilots_of_all_samples(evidence, buffers, settings, started, threads, given_up)
                 if previous is None
                 else ()
             )
@@ -100,10 +102,11 @@ def fit_fusion(
             given_up.set()
         images = whole_pilots.result()
     shape = evidence.mean.shape
-    fused = of_both_halves(lambda half: network.fuse_all(half).reshape(shape), threads)
+    halves = [start.examples.of_half(half) for half in (0, 1)]
+    fused = of_both_halves(lambda half: network.fuse(halves[half]).reshape(shape), threads)
     whole = None
     if images:
-        by_a, by_b = of_both_halves(lambda half: network.fuse_all(half, images).reshape(shape), threads)
+        by_a, by_b = of_both_halves(lambda half: network.fuse(halves[half], images).reshape(shape), threads)
         whole = np.float32(0.5) * (by_a + by_b)
     result = result_from_fused(
         evidence,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,27 +106,41 @@ class Standardisation:
     mean: npt.NDArray[np.float64]
     std: Array
 
-    def apply(self, inputs: Array) -> None:
-        """Standardise planes in place, shape (halves, pixels, planes), clipped to 4 standard deviations."""
-        for part in _parts(inputs):
-            np.clip(
-                (part - self.mean) / self.std, -LARGEST_INPUT, LARGEST_INPUT, out=part, casting="same_kind"
-            )
+    def apply(self, inputs: Array, threads: int) -> None:
+        """Standardise planes in place, shape (2, pixels, planes), clipped to 4 standard deviations."""
+
+        def apply(half: int) -> None:
+            for part in _parts(inputs[half]):
+                np.clip(
+                    (part - self.mean) / self.std,
+                    -LARGEST_INPUT,
+                    LARGEST_INPUT,
+                    out=part,
+                    casting="same_kind",
+                )
+
+        of_both_halves(apply, threads)
 
 
-def standardisation_of(inputs: Array) -> Standardisation:
-    """Return mean and standard deviation of every plane of shape (halves, pixels, planes)."""
+def standardisation_of(inputs: Array, threads: int) -> Standardisation:
+    """Return mean and standard deviation of every plane of shape (2, pixels, planes)."""
     count = inputs.shape[0] * inputs.shape[1]
-    mean = sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs)) / count
-    variance = sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs)) / count
+
+    def sums(half: int) -> Any:
+        return sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs[half]))
+
+    def squares(half: int) -> Any:
+        return sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs[half]))
+
+    mean = sum(of_both_halves(sums, threads)) / count
+    variance = sum(of_both_halves(squares, threads)) / count
     return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
 
 
-def _parts(inputs: Array) -> Iterator[Array]:
+def _parts(planes: Array) -> Iterator[Array]:
     """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
-    flat = inputs.reshape(-1, inputs.shape[2])
-    for first in range(0, len(flat), _PART_PIXELS):
-        yield flat[first : first + _PART_PIXELS]
+    for first in range(0, len(planes), _PART_PIXELS):
+        yield planes[first : first + _PART_PIXELS]
 
 
 def _log_level(image: FloatImage) -> FloatImage:

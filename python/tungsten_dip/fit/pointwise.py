@@ -9,7 +9,7 @@ once. The number of pixels is free.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import onnx
@@ -32,16 +32,32 @@ _RUN_PIXELS = 1 << 14
 
 @dataclass(frozen=True)
 class Examples:
-    """What a network is trained on, flattened; the first axis tells the halves apart.
+    """What a network is trained on: pixels of an image, those of half A first, or some of them.
 
-    ``inputs`` has shape (2, pixels, planes), ``choices`` (2, pixels, pilots, 3), ``wanted``, the other half's
-    colour, (2, pixels, 3), and ``weight``, of the squared error, (2, pixels, 1).
+    ``inputs`` has shape (pixels, planes), ``choices`` (pixels, pilots, 3), ``wanted``, the other half's
+    colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
     inputs: Array
     choices: Array
     wanted: Array
     weight: Array
+
+    def at(self, pixels: Indices) -> Examples:
+        """Return a copy of some of them."""
+        return Examples(*(values.take(pixels, axis=0) for values in self._arrays()))
+
+    def part(self, first: int, end: int) -> Examples:
+        """Return a view of consecutive ones."""
+        return Examples(*(values[first:end] for values in self._arrays()))
+
+    def of_half(self, half: int) -> Examples:
+        """Return a view of those of one half, of a whole image's."""
+        pixels = len(self.inputs) // 2
+        return self.part(half * pixels, (half + 1) * pixels)
+
+    def _arrays(self) -> tuple[Array, ...]:
+        return self.inputs, self.choices, self.wanted, self.weight
 
 
 def training_step(planes: int, choices: int) -> onnx.ModelProto:
@@ -80,16 +96,9 @@ def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
 
 
 class PointwiseNetwork:
-    """The network, its examples and the state of its optimiser."""
+    """The network and the state of its optimiser."""
 
-    def __init__(self, weights: Weights, examples: Examples, device: Device = "auto") -> None:
-        self._pixels = examples.inputs.shape[1]
-        # Both halves one after the other: one index for both is gathered far sooner than a pair.
-        self._examples = {
-            part.name: getattr(examples, part.name).reshape(-1, *getattr(examples, part.name).shape[2:])
-            for part in fields(Examples)
-        }
-        planes, choices = examples.inputs.shape[2], examples.choices.shape[2]
+    def __init__(self, weights: Weights, planes: int, choices: int, device: Device = "auto") -> None:
         self._shapes = weight_shapes(planes, choices)
         # The network is too small to share: threads would only wait for one another.
         self._step = session_from_proto(training_step(planes, choices), 1, device)
@@ -98,14 +107,16 @@ class PointwiseNetwork:
         self._mean, self._square = np.zeros_like(self._weights), np.zeros_like(self._weights)
         self._steps_done = 0
 
-    def step(self, half: Indices, pixel: Indices, learning_rate: float) -> None:
+    def step(self, batch: Examples, learning_rate: float) -> None:
         """Train on some pixels by one step of Adam: the mean of their weighted squared errors falls."""
         self._steps_done += 1
-        at = half * self._pixels + pixel
         self._weights, self._mean, self._square = self._step.run(
             ["next_weights", "next_mean", "next_square"],
             {
-                **{name: values.take(at, axis=0) for name, values in self._examples.items()},
+                "inputs": batch.inputs,
+                "choices": batch.choices,
+                "wanted": batch.wanted,
+                "weight": batch.weight,
                 "weights": self._weights,
                 "mean": self._mean,
                 "square": self._square,
@@ -114,25 +125,23 @@ class PointwiseNetwork:
             },
         )
 
-    def fuse(self, half: int, pixel: Indices) -> Array:
-        """Return the weighted mean of the pilots at some pixels, shape (pixels, 3).
+    def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> Array:
+        """Return the weighted mean of the pilots or, by the same weights, of ``images``; shape (pixels, 3).
 
         Raises InputError if it is not finite.
         """
-        at = half * self._pixels + pixel
-        return self._fused(*(self._examples[name].take(at, axis=0) for name in ("inputs", "choices")))
-
-    def fuse_all(self, half: int, images: Sequence[FloatImage] = ()) -> Array:
-        """Return the weighted mean of the pilots or, by the same weights, of ``images`` at every pixel."""
         flat = [image.reshape(-1, 3) for image in images]
-        fused = np.empty((self._pixels, 3), np.float32)
-        for first in range(0, self._pixels, _RUN_PIXELS):
-            part = slice(first, min(first + _RUN_PIXELS, self._pixels))
-            of_half = slice(half * self._pixels + part.start, half * self._pixels + part.stop)
-            choices = (
-                np.stack([image[part] for image in flat], 1) if flat else self._examples["choices"][of_half]
-            )
-            fused[part] = self._fused(self._examples["inputs"][of_half], choices)
+        fused = np.empty((len(examples.inputs), 3), np.float32)
+        for first in range(0, len(fused), _RUN_PIXELS):
+            part = slice(first, first + _RUN_PIXELS)
+            feeds = {
+                "inputs": examples.inputs[part],
+                "choices": np.stack([image[part] for image in flat], 1) if flat else examples.choices[part],
+                "weights": self._weights,
+            }
+            fused[part] = self._fuse.run(["fused"], feeds)[0]
+        if not np.isfinite(fused).all():
+            raise InputError("the model gives no finite image: its weights are too large; fit a new one")
         return fused
 
     def weights(self) -> Weights:
@@ -149,13 +158,6 @@ class PointwiseNetwork:
     def load(self, weights: Weights) -> None:
         """Replace the weights."""
         self._weights = self._vector(weights)
-
-    def _fused(self, inputs: Array, choices: Array) -> Array:
-        feeds = {"inputs": inputs, "choices": choices, "weights": self._weights}
-        fused: Array = self._fuse.run(["fused"], feeds)[0]
-        if not np.isfinite(fused).all():
-            raise InputError("the model gives no finite image: its weights are too large; fit a new one")
-        return fused
 
     def _vector(self, weights: Weights) -> Array:
         return np.concatenate([weights[name].ravel() for name in self._shapes])

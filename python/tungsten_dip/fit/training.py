@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
-from tungsten_dip.fit.evidence import Array, Evidence, Layout, with_best_reference
+from tungsten_dip.fit.evidence import Array, Evidence, Indices, Layout, with_best_reference
+from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.outcome import estimate_error, held_out_error
 from tungsten_dip.fit.planes import (
@@ -28,6 +30,10 @@ _HEAD_START = 1.0
 """Logit that the best single pilot starts with."""
 
 _WARM_UP_STEPS = 10
+_POOL_PIXELS = 1 << 17
+_POOL_PASSES = 4
+"""So many pixels are drawn at a time, and used so often: to draw one takes half as long as to train on it."""
+
 _HISTORY_EVERY = 20
 _PROBE_PIXELS = 1 << 15
 """Pixels that are not trained on: the error is estimated there."""
@@ -64,15 +70,15 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None = None)
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()
     if model is not None and model.standardisation is not None:
-        model.standardisation.apply(inputs)
+        model.standardisation.apply(inputs, evidence.threads)
         far_out = [float((np.abs(plane) >= LARGEST_INPUT).mean()) for plane in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
             return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
         notes = ("the model knows no such images: a network is fitted anew",)
         evidence = with_best_reference(evidence)
         inputs = network_inputs(evidence)
-    standardisation = standardisation_of(inputs)
-    standardisation.apply(inputs)
+    standardisation = standardisation_of(inputs, evidence.threads)
+    standardisation.apply(inputs, evidence.threads)
     weights = first_weights(evidence.layout, seed)
     return _start(evidence, inputs, standardisation, weights, warm=False, notes=notes)
 
@@ -88,15 +94,18 @@ def _start(
     """Return the start with its examples; its evidence holds no second copy of what they hold."""
     pixels = inputs.shape[1]
     choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
-    for index, pilot in enumerate(evidence.pilots):
-        for half in (0, 1):
+
+    def fill(half: int) -> None:
+        for index, pilot in enumerate(evidence.pilots):
             choices[half, :, index] = pilot[half].reshape(pixels, 3)
-    wanted = np.stack([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
-    weight = np.stack([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
+
+    of_both_halves(fill, evidence.threads)
+    wanted = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
+    weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
     # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
     pilots = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
-    examples = Examples(inputs, choices, wanted, weight)
+    examples = Examples(inputs.reshape(2 * pixels, -1), choices.reshape(2 * pixels, -1, 3), wanted, weight)
     evidence = replace(evidence, pilots=pilots, features=({}, {}))
     return Start(evidence, examples, standardisation, weights, warm, notes)
 
@@ -115,6 +124,22 @@ def first_weights(layout: Layout, seed: int) -> Weights:
     weights["layer3.weight"][:] = 0
     weights["layer3.bias"][layout.reference] = _HEAD_START
     return weights
+
+
+def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
+    """Yield ``size`` of both halves' examples at a time, or all if they are fewer, without end.
+
+    ``trained`` are the pixels that they may show.
+    """
+    count, pixels = 2 * len(trained), len(examples.inputs) // 2
+    drawn = min(_POOL_PIXELS, count)
+    size = min(size, drawn)
+    while True:
+        half, index = np.divmod(rng.choice(count, drawn, replace=False), len(trained))
+        pool = examples.at(half * pixels + trained[index])
+        for _ in range(_POOL_PASSES):
+            for end in range(size, drawn + 1, size):
+                yield pool.part(end - size, end)
 
 
 @dataclass
@@ -144,16 +169,19 @@ def train(
     tell it, falls no further.
     """
     rng = np.random.default_rng(settings.seed)
-    warm, pixels = start.warm, start.examples.inputs.shape[1]
+    threads = start.evidence.threads
+    warm, pixels = start.warm, len(start.examples.inputs) // 2
     order = rng.permutation(pixels)
     held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
     probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
     pilots = start.evidence.pilots_at(probe)
+    probes = [start.examples.of_half(half).at(probe) for half in (0, 1)]
+    batches = _batches(start.examples, trained, batch_pixels, rng)
     done = Training(notes=list(start.notes))
 
     def estimate(step: int) -> tuple[float, float]:
         """Return the error, and what the other half says of it."""
-        fused_a, fused_b = (network.fuse(half, probe) for half in (0, 1))
+        fused_a, fused_b = of_both_halves(lambda half: network.fuse(probes[half]), threads)
         errors = estimate_error(pilots, start.evidence.scale, fused_a, fused_b)
         error = float(errors.mean(dtype=np.float64))
         done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
@@ -169,8 +197,7 @@ def train(
             # What the learning rate anneals over is what ends first: the steps or the budget.
             gone = max((step - 1) / steps, min((time.perf_counter() - begun) / left_s, 1.0))
             rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * gone)
-            batch = rng.integers(2 * len(trained), size=min(batch_pixels, 2 * len(trained)))
-            network.step(batch // len(trained), trained[batch % len(trained)], LEARNING_RATE * rate)
+            network.step(next(batches), LEARNING_RATE * rate)
             done.steps_done = step
             if step % every != 0 and step != steps and step != 1:
                 continue
