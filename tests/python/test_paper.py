@@ -9,7 +9,7 @@ from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers  # noqa: 
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.fit import paper  # noqa: E402
 from tungsten_dip.fit.inputs import ldr_from_radiance, paper_images, radiance_from_ldr  # noqa: E402
-from tungsten_dip.fit.paper import PaperFit, fit_paper, learning_rate  # noqa: E402
+from tungsten_dip.fit.paper import INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
 from tungsten_dip.fit.settings import FitSettings  # noqa: E402
 from tungsten_dip.progress import silent  # noqa: E402
 
@@ -265,3 +265,14 @@ def test_nan_is_refused():
 def test_a_missing_device_is_an_input_error():
     with pytest.raises(InputError, match="device cuda"):
         fit_paper(noise_buffers(), settings(device="cuda"))
+
+
+def test_bfloat16_moves_the_network_by_less_than_its_input_noise():
+    fit = PaperFit(paper_images(noise_buffers(48, 64), settings()), settings(), torch.device("cpu"))
+    x = torch.rand(1, 42, 48, 64, generator=torch.Generator().manual_seed(0))
+    noise = INPUT_NOISE_STD * torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        exact, noisy = fit.network(x), fit.network(x + noise)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = fit.network(x).float()
+    assert 0 < (rounded - exact).std() < 0.5 * (noisy - exact).std()

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.device import compute_device
+from tungsten_dip.fit.device import compute_device, convolutions_in_bfloat16
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, Weights, check_planes, check_settings, source_sha256
 from tungsten_dip.fit.networks import ResNet, Skip
@@ -68,6 +68,8 @@ class PaperFit:
         self._noise_pool = torch.randn(pool_size, generator=generator).to(device)
         self._generator = generator
 
+        # Rounding is far below the noise that every iteration adds to the input.
+        self._precision = convolutions_in_bfloat16(device)
         self._wanted = _nchw(torch.from_numpy(images.wanted).to(device))
         self._average: Tensor | None = None
         with torch.random.fork_rng(devices=[]):
@@ -93,7 +95,8 @@ class PaperFit:
         noise = noise.view(self._input.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
         torch.add(self._input, noise, alpha=INPUT_NOISE_STD, out=self._noisy_input)
 
-        output = self.network(self._noisy_input)
+        with self._precision:
+            output = self.network(self._noisy_input).float()
         loss = F.mse_loss(output, self._wanted)
         seen = output.detach()
         self.loss = loss.item()
