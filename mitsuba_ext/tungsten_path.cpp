@@ -11,6 +11,8 @@
 //   include_surfaces               light that no medium scattered counts (true)
 //   reconstruction_filter          Tungsten's name of the filter that distributes the samples ("tent")
 //   pixel_center                   where in the pixel the filter is centred (0.5)
+//   lens_blades, lens_angle        corners of the thin lens's aperture (0: a disk) and where the first is (0)
+//   diaphragm_distance             how far behind the lens a second diaphragm of lens_radius is (0: none)
 //   threads                        number of threads, the calling one included (1)
 //   albedo_<id>                    texture: the albedo of the BSDF of that id, one for each that is seen
 //
@@ -53,6 +55,8 @@
 #include <string>
 #include <string_view>
 #include <vector>
+
+#include "tungsten_lens.hpp"
 
 namespace mitsuba {
 namespace {
@@ -279,6 +283,7 @@ class TungstenPath final : public Variant::Integrator {
           include_surfaces_(properties.get<bool>("include_surfaces", true)),
           filter_(properties.get<std::string_view>("reconstruction_filter", "tent")),
           pixel_center_(properties.get<float>("pixel_center", 0.5f)),
+          lens_(properties),
           threads_(properties.get<uint32_t>("threads", 1)) {
         std::istringstream names{std::string(
             properties.get<std::string_view>("quantities", "color albedo normal depth visibility"))};
@@ -365,11 +370,14 @@ class TungstenPath final : public Variant::Integrator {
                                   static_cast<float>(size.x()),
                               (static_cast<float>(position.y()) + pixel_center_ + offset.y()) /
                                   static_cast<float>(size.y()));
-            const Point2 lens = sensor.needs_aperture_sample() ? random.next_2d() : Point2(0.5f);
+            const Point2 lens =
+                sensor.needs_aperture_sample() ? lens_.aperture_sample(random.next_2d()) : Point2(0.5f);
             auto [ray, weight] = sensor.sample_ray(0.f, 0.f, film, lens);
             undo_clipping(sensor, ray);
             Sample sample;
-            sample.set(color, weight * radiance(scene, sensor.medium(), ray, random, sample));
+            sample.set(color, lens_.lets_through(sensor, ray)
+                                  ? weight * radiance(scene, sensor.medium(), ray, random, sample)
+                                  : Rgb(0.f));
             for (const Quantity quantity : quantities_)
                 if (const auto& value = sample.get(quantity)) accumulators[quantity].add(*value);
         }
@@ -662,6 +670,7 @@ class TungstenPath final : public Variant::Integrator {
     bool include_surfaces_;
     FilterTable filter_;
     float pixel_center_;
+    TungstenLens lens_;
     uint32_t threads_;
     std::vector<Quantity> quantities_;
     std::map<std::string, ref<Texture>, std::less<>> albedos_;

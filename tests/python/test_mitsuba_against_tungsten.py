@@ -163,6 +163,14 @@ CASES = {
         for name in ("dirac", "box", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos")
     },
     "thinlens": changed("camera", type="thinlens", aperture_size=0.1, focus_distance=4.5),
+    "blades": changed(
+        "camera",
+        type="thinlens",
+        aperture_size=0.3,
+        focus_distance=2,
+        aperture={"type": "blade", "blades": 3, "angle": 0.2},
+    ),
+    "cat's eye": changed("camera", type="thinlens", aperture_size=0.3, focus_distance=4, cateye=0.2),
     "bounces": changed("integrator", min_bounces=2, max_bounces=4),
     "no light sampling": changed("integrator", enable_light_sampling=False),
     "consistency checks": changed("integrator", enable_consistency_checks=True),

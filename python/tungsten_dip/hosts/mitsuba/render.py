@@ -142,6 +142,7 @@ def _scene_with_integrator(
         "threads": threads or len(os.sched_getaffinity(0)),
         "reconstruction_filter": translated.reconstruction_filter,
         "pixel_center": translated.pixel_center,
+        **translated.lens,
         **{name: getattr(translated.integrator, name) for name in _TRACE_SETTINGS},
         **{f"albedo_{bsdf}": texture for bsdf, texture in translated.albedo.items()},
     }

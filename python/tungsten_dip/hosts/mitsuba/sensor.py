@@ -6,6 +6,8 @@ to the right. Tungsten's field of view is horizontal.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from tungsten_dip.hosts.mitsuba.media import medium_object
@@ -44,7 +46,8 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
         node["medium"] = medium_object(t, camera.medium)
     if isinstance(camera, ts.PinholeCamera) or camera.aperture_size == 0.0:
         return {"type": "perspective", **node}
-    return {"type": "thinlens", **node, **_lens(t, camera)}
+    lens = {"aperture_radius": camera.aperture_size, "focus_distance": _focus_distance(t, camera)}
+    return {"type": "thinlens", **node, **lens}
 
 
 def pixel_center(camera: ts.Camera) -> float:
@@ -52,12 +55,27 @@ def pixel_center(camera: ts.Camera) -> float:
     return 0.0 if isinstance(camera, ts.ThinlensCamera) else 0.5
 
 
-def _lens(t: Translation, camera: ts.ThinlensCamera) -> Node:
+def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
+    """Return what the integrator is told of a lens that Mitsuba's sensor does not know.
+
+    Raises InputError for an aperture without counterpart.
+    """
+    if not isinstance(camera, ts.ThinlensCamera) or camera.aperture_size == 0.0:
+        return {}
+    t.place = f"camera of type {camera.kind}"
+    lens: dict[str, float] = {}
+    match camera.aperture:
+        case ts.DiskTexture():
+            pass
+        case ts.BladeTexture():
+            lens = {"lens_blades": camera.aperture.blades, "lens_angle": camera.aperture.angle}
+        case _:
+            raise t.unsupported(f"an aperture of type {camera.aperture.kind}")
     if camera.cateye > 0.0:
-        raise t.unsupported("cateye")
-    if not isinstance(camera.aperture, ts.DiskTexture):
-        raise t.unsupported(f"an aperture of type {camera.aperture.kind}")
-    return {"aperture_radius": camera.aperture_size, "focus_distance": _focus_distance(t, camera)}
+        plane_distance = 1 / math.tan(math.radians(camera.fov) / 2)
+        lens["lens_radius"] = camera.aperture_size
+        lens["diaphragm_distance"] = camera.cateye * plane_distance
+    return lens
 
 
 def _focus_distance(t: Translation, camera: ts.ThinlensCamera) -> float:

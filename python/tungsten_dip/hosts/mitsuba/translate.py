@@ -13,7 +13,7 @@ from tungsten_dip.hosts.mitsuba.emitters import (
     point_node,
     together,
 )
-from tungsten_dip.hosts.mitsuba.sensor import pixel_center, sensor_node
+from tungsten_dip.hosts.mitsuba.sensor import lens_of_integrator, pixel_center, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.hosts.mitsuba.translation import Node, Translation
@@ -59,6 +59,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
         integrator,
         scene.camera.reconstruction_filter,
         pixel_center(scene.camera),
+        lens_of_integrator(t, scene.camera),
     )
 
 

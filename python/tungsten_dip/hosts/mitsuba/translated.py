@@ -23,6 +23,7 @@ class TranslatedScene:
 
     ``reconstruction_filter`` is Tungsten's, whose samples are distributed by the filter instead of weighted
     by it. ``pixel_center`` is where the filter is centred in a pixel: 0.5, but 0 for Tungsten's thin lens.
+    ``lens`` holds what the integrator is told of a thin lens beyond the sensor.
     """
 
     scene: Mapping[str, Any]
@@ -30,3 +31,4 @@ class TranslatedScene:
     integrator: PathTracer = field(default_factory=PathTracer)
     reconstruction_filter: FilterName = "tent"
     pixel_center: float = 0.5
+    lens: Mapping[str, float] = field(default_factory=dict)
