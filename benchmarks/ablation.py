@@ -49,7 +49,7 @@ VARIANTS: dict[str, Change] = {
     "no pilot that sees the colour alone": _without(lambda pilot: pilot.by_color),
     "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
-        pilots, "_along_edges", lambda image, *_: image
+        pilots, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
     "no pilots of all samples": lambda: mock.patch.object(fusion, "pilots_of_all_samples", return_value=()),
     "empty space like any other": lambda: mock.patch.object(evidence, "_something", return_value=1),

@@ -53,12 +53,20 @@ class Environments final : public Emitter<Float, Spectrum> {
         const auto count = static_cast<float>(m_lights.size());
         const float chosen = std::min(std::floor(sample.x() * count), count - 1.f);
         const Point2f reused(sample.x() * count - chosen, sample.y());
-        auto [direction, weight] =
-            m_lights[static_cast<size_t>(chosen)].emitter->sample_direction(it, reused, active);
+        const Light& light = m_lights[static_cast<size_t>(chosen)];
+        auto [direction, weight] = light.emitter->sample_direction(it, reused, active);
         if (!(direction.pdf > 0.f)) return {direction, Spectrum(0.f)};
-        direction.pdf = pdf_direction(it, direction, active);
+        // What the light itself says of its sample is exact; asked for the same direction, it may round.
+        Spectrum value = weight * direction.pdf;
+        const SurfaceInteraction3f seen = seen_in(direction);
+        for (const Light& other : m_lights) {
+            if (&other == &light) continue;
+            value += other.emitter->eval(seen, active);
+            direction.pdf += other.emitter->pdf_direction(it, direction, active);
+        }
+        direction.pdf /= count;
         direction.emitter = this;
-        return {direction, eval_direction(it, direction, active) / direction.pdf};
+        return {direction, value / direction.pdf};
     }
 
     Float pdf_direction(const Interaction3f& it, const DirectionSample3f& direction,
@@ -71,10 +79,8 @@ class Environments final : public Emitter<Float, Spectrum> {
     // What comes from a direction in all.
     Spectrum eval_direction(const Interaction3f& /*it*/, const DirectionSample3f& direction,
                             Mask active) const override {
-        auto si = dr::zeros<SurfaceInteraction3f>();
-        si.wi = -direction.d;
         Spectrum sum(0.f);
-        for (const Light& light : m_lights) sum += light.emitter->eval(si, active);
+        for (const Light& light : m_lights) sum += light.emitter->eval(seen_in(direction), active);
         return sum;
     }
 
@@ -89,6 +95,13 @@ class Environments final : public Emitter<Float, Spectrum> {
         ref<Base> emitter;
         bool is_cap;
     };
+
+    // Lights around the scene want a ray that hit nothing; their `eval_direction` wants coordinates in a map.
+    static SurfaceInteraction3f seen_in(const DirectionSample3f& direction) {
+        auto si = dr::zeros<SurfaceInteraction3f>();
+        si.wi = -direction.d;
+        return si;
+    }
 
     std::vector<Light> m_lights;
 };

@@ -309,6 +309,8 @@ class TungstenPath final : public Variant::Integrator {
                     bool /*evaluate*/) override {
         m_render_timer.reset();
         sees_through_ = has_transparency(*scene);
+        surrounded_by_several_ =
+            scene->environment() != nullptr && scene->environment()->class_name() == "Environments";
         const auto size = sensor->film()->crop_size();
         const size_t channels = pixel_channels();
         std::vector<float> image(static_cast<size_t>(size.x()) * size.y() * channels);
@@ -468,10 +470,14 @@ class TungstenPath final : public Variant::Integrator {
         std::optional<float> light_visibility;
         if (samples_lights && path.bounce < max_bounces_ - 1)
             light_visibility = light_from_surface(scene, bsdf, random, path);
+        // Light that is weighed against light samples counts on the way through as well: those do not ask how
+        // the path goes on from here.
+        const bool is_lit_by =
+            next.kind != Scattering::forward || (!path.was_specular && path.samples_lights);
+        if (emitter != nullptr && path.bounce >= min_bounces_ && is_lit_by)
+            path.radiance += path.throughput * emitted(scene, hit, *emitter, path);
         if (next.kind != Scattering::forward) {
             goes_on = goes_on && is_consistent(hit, direction, next.local_direction);
-            if (emitter != nullptr && path.bounce >= min_bounces_)
-                path.radiance += path.throughput * emitted(scene, hit, *emitter, path);
             if (goes_on) {
                 path.was_specular = next.kind == Scattering::specular;
                 path.vertex = hit;
@@ -513,12 +519,17 @@ class TungstenPath final : public Variant::Integrator {
 
     // What an emitter sends back along the ray, weighted against the sampling of emitters at the vertex
     // before.
-    static Rgb emitted(const Scene& scene, const SurfaceHit& hit, const Emitter& emitter, const Path& path) {
-        const Rgb emission = emitter.eval(hit);
-        if (path.was_specular || !path.samples_lights || is_black(emission)) return emission;
+    [[nodiscard]] Rgb emitted(const Scene& scene, const SurfaceHit& hit, const Emitter& emitter,
+                              const Path& path) const {
+        const Rgb seen = emitter.eval(hit);
+        if (path.was_specular || !path.samples_lights) return seen;
         const Variant::DirectionSample3f towards(&scene, hit, path.vertex);
-        // Of several lights around the scene a ray sees one, but all light a surface.
-        return emitter.eval_direction(path.vertex, towards) *
+        // Of several lights around the scene a ray sees one, but all light a surface. (The others' own
+        // `eval_direction` wants coordinates in their map, which only their samples have.)
+        const bool all_light = surrounded_by_several_ && &emitter == scene.environment();
+        const Rgb emission = all_light ? Rgb(emitter.eval_direction(path.vertex, towards)) : seen;
+        if (is_black(emission)) return emission;
+        return emission *
                power_heuristic(path.direction_pdf, scene.pdf_emitter_direction(path.vertex, towards));
     }
 
@@ -676,6 +687,7 @@ class TungstenPath final : public Variant::Integrator {
     std::map<std::string, ref<Texture>, std::less<>> albedos_;
     bool records_features_ = false;
     bool sees_through_ = true;
+    bool surrounded_by_several_ = false;  // by lights of the plugin tungsten_environments
     float progress_ = 0.f;
 };
 

@@ -315,15 +315,16 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
 }
 
 Evidence Render::evidence() const {
+    const std::uint32_t spp = current_spp();  // throws where there is no scene any more
     Camera& camera = *impl_->scene->camera();
     const bool features = impl_->plan.writes_features;
-    return evidence_of(camera, current_spp(), features, means_for(camera, features), false);
+    return evidence_of(camera, spp, features, means_for(camera, features), false);
 }
 
 Evidence Render::take_evidence() {
+    const std::uint32_t spp = current_spp();  // throws where there is no scene any more
     Camera& camera = *impl_->scene->camera();
-    Evidence evidence =
-        evidence_of(camera, current_spp(), impl_->plan.writes_features, std::move(impl_->means), true);
+    Evidence evidence = evidence_of(camera, spp, impl_->plan.writes_features, std::move(impl_->means), true);
     impl_->traceable.reset();
     impl_->scene.reset();
     return evidence;

@@ -13,13 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tungsten_dip.buffers.image_file import read_image, write_image
     from tungsten_dip.buffers.model import Buffer, RenderBuffers
     from tungsten_dip.buffers.read import read_buffers
     from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
     from tungsten_dip.fit.model import Model
-    from tungsten_dip.fit.settings import FitResult, FitSettings
+    from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
     from tungsten_dip.hosts import render
     from tungsten_dip.onnx import infer, load_model, save_model
     from tungsten_dip.report.metrics import Comparison, compare
@@ -32,6 +33,7 @@ _MODULE_BY_NAME = {
     "Comparison": "report.metrics",
     "FitResult": "fit.settings",
     "FitSettings": "fit.settings",
+    "HistoryPoint": "fit.settings",
     "InputError": "errors",
     "Model": "fit.model",
     "RenderBuffers": "buffers.model",
@@ -41,9 +43,11 @@ _MODULE_BY_NAME = {
     "load_model": "onnx",
     "load_scene": "scene.parse",
     "read_buffers": "buffers.read",
+    "read_image": "buffers.image_file",
     "render": "hosts",
     "save_model": "onnx",
     "write_denoised": "buffers.write",
+    "write_image": "buffers.image_file",
 }
 
 __all__ = [
@@ -51,6 +55,7 @@ __all__ = [
     "Comparison",
     "FitResult",
     "FitSettings",
+    "HistoryPoint",
     "InputError",
     "Model",
     "RenderBuffers",
@@ -61,9 +66,11 @@ __all__ = [
     "load_model",
     "load_scene",
     "read_buffers",
+    "read_image",
     "render",
     "save_model",
     "write_denoised",
+    "write_image",
 ]
 
 

@@ -12,6 +12,7 @@ NAMES = {
     "Comparison",
     "FitResult",
     "FitSettings",
+    "HistoryPoint",
     "InputError",
     "Model",
     "RenderBuffers",
@@ -22,9 +23,11 @@ NAMES = {
     "load_model",
     "load_scene",
     "read_buffers",
+    "read_image",
     "render",
     "save_model",
     "write_denoised",
+    "write_image",
 }
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image
+from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image, write_image
 from tungsten_dip.errors import InputError
 
 HEIGHT, WIDTH = 5, 7
@@ -389,18 +389,26 @@ def test_a_scene_names_its_buffers(tmp_path: Path) -> None:
         read_buffers(path)
 
 
+def test_a_scene_may_hold_comments_and_trailing_commas(tmp_path: Path) -> None:
+    write_image(tmp_path / "c.exr", np.full((2, 3, 3), 0.5, np.float32))
+    buffers = '[{"type": "color", "hdr_output_file": "c.exr"},]'
+    text = f'\ufeff{{"renderer": {{ // what is saved\n "output_buffers": {buffers} }}}}'
+    (tmp_path / "scene.json").write_text(text, encoding="utf-8")
+    assert read_buffers(tmp_path / "scene.json").color.mean.shape == (2, 3, 3)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{\n  broken", "line 2 is not JSON"),
-        ("[]", "renderer.output_buffers"),
+        ("{\n  broken", ":2:3: expected JSON"),
+        ("[]", "expected a JSON object"),
         ('{"renderer": {"output_buffers": [{"hdr_output_file": "c.exr"}]}}', "renderer.output_buffers"),
         ('{"renderer": {"output_buffers": [{"type": [], "hdr_output_file": 3}]}}', "renderer.output_buffers"),
         ('{"renderer": {"output_buffers": 7}}', "renderer.output_buffers"),
         ('{"renderer": {}}', "saves no colour"),
         ("{}", "saves no colour"),
         ('{"renderer": {"hdr_output_file": "render.exr"}}', "render the scene first"),
-        ("[" * 100_000, "renderer.output_buffers"),
+        ("[" * 100_000, "nested too deeply"),
     ],
 )
 def test_a_broken_scene_is_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -422,7 +430,7 @@ def refused(path: Path, message: str) -> None:
 
 def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
     refused(tmp_path / "none.exr", "no such file")
-    refused(tmp_path / "none.json", "cannot be read")
+    refused(tmp_path / "none.json", "expected a Tungsten scene file, found none")
     refused(tmp_path, "found no image.*--map color=FILE")
     for suffix in (".exr", ".pfm", ".hdr"):
         (tmp_path / f"text{suffix}").write_text("hello world " * 100)

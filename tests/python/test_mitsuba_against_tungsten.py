@@ -154,10 +154,25 @@ def outdoors() -> dict[str, Any]:
     return scene
 
 
+def under(*lights: dict[str, Any]) -> dict[str, Any]:
+    """The room without its lamp, lit from around alone."""
+    scene = copy.deepcopy(ROOM)
+    scene["primitives"][-2:] = lights
+    return scene
+
+
 CASES = {
     "tent": ROOM,
     "bump": bumpy(),
     "sky and suns": outdoors(),
+    "sky map": under(
+        {"type": "infinite_sphere", "emission": "heights.png", "transform": {"rotation": [20, 30, 0]}}
+    ),
+    "skydome": under({"type": "skydome", "transform": {"rotation": [30, 0, 20]}}),
+    "skydome and sun": under(
+        {"name": "sky", "type": "skydome", "transform": {"rotation": [30, 0, 20]}},
+        {"type": "infinite_sphere_cap", "skydome": "sky", "cap_angle": 0.27, "emission": 2e4},
+    ),
     **{
         name: changed("camera", reconstruction_filter=name)
         for name in ("dirac", "box", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos")

@@ -349,6 +349,75 @@ def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -
         np.testing.assert_allclose(render(folder, [mirror, *lights], down).color.mean, seen, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["bitmap", "skydome", "cap", "together", "ball"])
+def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
+    """What paths find by themselves and what they are shown must be the same light."""
+    pixels = np.full((8, 16, 3), 0.1, np.float32)
+    pixels[1:3, 3:6] = [20.0, 10.0, 5.0]
+    write_image(folder / "map.pfm", pixels)
+    bitmap = {"type": "infinite_sphere", "emission": "map.pfm", "transform": {"rotation": [0, 50, 0]}}
+    cap = {
+        "type": "infinite_sphere_cap",
+        "cap_angle": 25,
+        "emission": 5,
+        "transform": {"rotation": [0, 0, 40]},
+    }
+    lights: dict[str, list[Json]] = {
+        "bitmap": [bitmap],
+        "skydome": [{"type": "skydome", "transform": {"rotation": [40, 0, 0]}}],
+        "cap": [cap],
+        "together": [bitmap, WHITE_SKY],
+        "ball": [{**ball(GREY), "emission": 3.0}],
+    }
+    means = []
+    for samples_lights in (True, False):
+        integrator = {"type": "path_tracer", "enable_light_sampling": samples_lights}
+        lit = render(folder, [FLOOR, *lights[kind]], DOWN, spp=2048, integrator=integrator)
+        means.append(lit.color.mean.mean(axis=(0, 1)))
+    if kind == "together":  # without light samples, what a ray sees is all that there is
+        assert (means[0] > 1.5 * means[1]).all()
+        return
+    np.testing.assert_allclose(means[0], means[1], rtol=0.02)
+
+
+def test_a_sun_as_small_as_the_real_one_beside_a_sky(folder: Path) -> None:
+    sun = {"type": "infinite_sphere_cap", "cap_angle": 0.27, "emission": 5e4}
+    lit = render(folder, [FLOOR, WHITE_SKY, sun], DOWN, spp=64).color.mean
+    expected = 0.5 * (1 + 5e4 * math.sin(math.radians(0.27)) ** 2)
+    np.testing.assert_allclose(lit, expected, rtol=0.5)  # no fireflies
+    np.testing.assert_allclose(lit.mean(), expected, rtol=0.02)
+
+
+def test_a_mirrored_sphere_is_seen_from_without(folder: Path) -> None:
+    mirrored = {"type": "sphere", "transform": {"scale": [-1, 1, 1]}, "bsdf": GREY, "emission": 2.0}
+    view = {"position": [0, 0, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]}
+    buffers = render(folder, [mirrored], {"transform": view, "fov": 2})
+    np.testing.assert_allclose(buffers.color.mean, 2.0, rtol=1e-5)
+    np.testing.assert_allclose(buffers.normal.mean[:, :, 2], 1.0, atol=0.02)
+
+
+def test_a_smooth_mesh_shines_on_the_side_of_its_faces(folder: Path) -> None:
+    # The vertex normals point against the winding.
+    (folder / "lamp.obj").write_text(
+        "v -1 3 -1\nv 1 3 -1\nv 1 3 1\nv -1 3 1\nvn 0 1 0\nf 1//1 2//1 3//1\nf 1//1 3//1 4//1\n"
+    )
+    lamp = {"type": "mesh", "file": "lamp.obj", "emission": 5.0, "bsdf": {"type": "null"}}
+    smooth, flat = (
+        render(folder, [FLOOR, {**lamp, "smooth": smooth}], DOWN, spp=64).color.mean.mean()
+        for smooth in (True, False)
+    )
+    assert flat > 0.1
+    assert smooth == pytest.approx(flat, rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "opaque"), [("colour.png", True), ("alpha.png", False), ("sky.hdr", False)])
+def test_what_tungsten_decodes_to_four_channels_is_opaque(folder: Path, name: str, opaque: bool) -> None:
+    veil = {"type": "transparency", "alpha": name, "base": {"type": "lambert", "albedo": 0.0}}
+    sheet = {**FLOOR, "bsdf": veil, "transform": {"position": [0, 1, 0], "scale": [8, 1, 8]}}
+    seen = render(folder, [sheet, WHITE_SKY], {**DOWN, "fov": 20}, spp=16).color.mean
+    assert (seen.max() == 0) == opaque
+
+
 def test_without_lights_the_sky_is_white(folder: Path) -> None:
     buffers = render(folder, [{**ball(WHITE), "emission": 0.0}], {"fov": 15})
     np.testing.assert_allclose(buffers.color.mean.mean(), 1.0, rtol=0.02)
@@ -664,6 +733,8 @@ def with_medium(**fields: Any) -> Json:
     }
 
 
+SHEARED = [1, 0, 0.5, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
 REFUSED: dict[str, Json] = {
     "lambertian_fiber": surface({"type": "lambertian_fiber"}),
     "rough_wire": surface({"type": "rough_wire"}),
@@ -684,7 +755,8 @@ REFUSED: dict[str, Json] = {
     "two smooth layers": surface(
         {"type": "mixed", "bsdf0": {"type": "plastic"}, "bsdf1": {"type": "plastic"}}
     ),
-    "sheared quad": surface(GREY, transform=[1, 0, 0.5, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
+    "sheared transform": {"primitives": [{"type": "cube", "transform": SHEARED}]},
+    "sheared quad": surface(GREY, transform=SHEARED),
     "cone_angle": {"primitives": [{"type": "disk", "emission": 1.0, "cone_angle": 30}]},
     "cylinder without caps": {"primitives": [{"type": "cylinder", "emission": 1.0, "capped": False}]},
     "texture on a cylinder": {

@@ -548,6 +548,8 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"with_position"', '"mean"'), "pilots"),
     (metadata('"preset": "draft"', '"preset": ["draft"]'), "preset"),
     (metadata('"channels": [8', '"channels": [-8'), "channels"),
+    (metadata('"channels": [8', '"channels": [' + 62 * "8, " + "8"), "channels"),
+    (metadata('"channels": [8', '"channels": [' + 20_000 * "8, " + "8"), "channels"),
     (metadata('"seed": 0', '"seed": NaN'), "JSON"),
     (metadata('"noise"', '"nois"'), "planes"),
     (metadata('"version": "', '"version": "1'), "constants or attributes|graph"),

@@ -12,10 +12,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from tungsten_dip.buffers import FloatImage, RenderBuffers, read_image, write_tungsten_folder
+from tungsten_dip.buffers import FEATURES, FloatImage, RenderBuffers, read_image, write_tungsten_folder
 from tungsten_dip.errors import InputError
-
-_FEATURES = ("albedo", "normal", "depth")
 
 
 def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
@@ -27,7 +25,7 @@ def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
     """
     if not buffers.color.has_halves or buffers.color.variance is None:
         raise InputError("NFOR: expected a colour with halves A and B and its variance; save them as well")
-    kept = {name: getattr(buffers, name) for name in _FEATURES}
+    kept = {name: getattr(buffers, name) for name in FEATURES}
     kept = {
         name: buffer if buffer and buffer.has_halves and buffer.variance is not None else None
         for name, buffer in kept.items()

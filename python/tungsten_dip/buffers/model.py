@@ -24,8 +24,8 @@ FloatImage = npt.NDArray[np.float32]
 CHANNELS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
 """Channel count of every quantity a renderer may write."""
 
-FEATURES = ("albedo", "normal", "depth", "visibility")
-"""The quantities that guide the fit, in the order in which a network sees them."""
+FEATURES = ("albedo", "normal", "depth")
+"""The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class RenderBuffers:
     ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose.
 
-    Raises InputError if the shapes or the channel counts do not fit together.
+    Raises InputError if the shapes or the channel counts do not fit together, or an array is no C-contiguous
+    float32.
     """
 
     color: Buffer
@@ -79,13 +80,10 @@ class RenderBuffers:
         expected = self.color.mean.shape[:2]
         for quantity, buffer in self.quantities():
             for plane, array in buffer.planes():
-                shape = (*expected, CHANNELS[quantity])
-                if array.shape != shape or array.dtype != np.float32:
-                    raise InputError(
-                        f"{quantity} {plane}: expected float32 of shape {shape} (height, width, channels) as "
-                        f"the colour has it, got {array.dtype} of shape {array.shape}; render all buffers at "
-                        f"one size"
-                    )
+                _check(f"{quantity} {plane}", array, (*expected, CHANNELS[quantity]))
+        for name, more in (("alpha", self.alpha), ("spp", self.spp)):
+            if isinstance(more, np.ndarray):
+                _check(name, more, (*expected, 1))
 
     @property
     def height(self) -> int:
@@ -107,3 +105,13 @@ class RenderBuffers:
     def with_quantities(self, **buffers: Buffer | None) -> RenderBuffers:
         """Return a copy with some quantities replaced."""
         return replace(self, **buffers)  # type: ignore[arg-type]
+
+
+def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:
+    if array.shape != shape or array.dtype != np.float32:
+        raise InputError(
+            f"{what}: expected float32 of shape {shape} (height, width, channels) as the colour has it, got "
+            f"{array.dtype} of shape {array.shape}; render all buffers at one size"
+        )
+    if not array.flags.c_contiguous:
+        raise InputError(f"{what}: expected rows one after the other in memory; use np.ascontiguousarray")

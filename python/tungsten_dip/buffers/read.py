@@ -20,6 +20,7 @@ from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
+from tungsten_dip.json_file import object_from_json_file
 
 log = logging.getLogger(__name__)
 
@@ -101,8 +102,8 @@ def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path
 
 def _files_of_scene(path: Path) -> dict[str, Path]:
     """The files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them."""
+    scene = object_from_json_file(path)
     try:
-        scene = json.loads(path.read_text(encoding="utf-8"))
         renderer = scene.get("renderer", {})
         folder = path.parent / renderer.get("output_directory", "")
         requests = renderer.get("output_buffers", [])
@@ -121,11 +122,7 @@ def _files_of_scene(path: Path) -> dict[str, Path]:
             }
         if "color" not in files and renderer.get("hdr_output_file"):
             files["color"] = folder / renderer["hdr_output_file"]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the name") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno} is not JSON ({error.msg}); mend the scene") from error
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected renderer.output_buffers such as "
             '[{"type": "color", "hdr_output_file": "color.exr"}]; mend the scene'

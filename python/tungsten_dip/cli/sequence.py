@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -80,7 +81,8 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         check_writable(options.report, (".html",))
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
-    run = Run(settings, options.refit, dict(options.map), options.half)
+    digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
+    run = Run(settings, options.refit, dict(options.map), options.half, digest)
     models = Models(first=warm_start)
 
     with _without_repetition(), progress_on_stderr("denoising") as progress:

@@ -145,7 +145,9 @@ def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     def infer(buffers: RenderBuffers) -> FitResult:
         with progress_on_stderr("denoising") as progress:
-            return tungsten_dip.infer(model, buffers, options.threads, progress, refit_steps=options.refit)
+            return tungsten_dip.infer(
+                model, buffers, progress, threads=options.threads, refit_steps=options.refit
+            )
 
     return _denoised(options, infer)
 

@@ -31,6 +31,7 @@ def denoise(
     buffers: RenderBuffers,
     settings: FitSettings | None = None,
     progress: Progress = silent,
+    *,
     candidates: Sequence[tuple[FloatImage, FloatImage]] = (),
     warm_start: Model | None = None,
     previous: tuple[FloatImage, FloatImage] | None = None,
@@ -39,8 +40,8 @@ def denoise(
 
     ``buffers`` hold linear radiance of any exposure; they are sanitised first, and only the colour is
     required. The result is linear radiance of the same shape, finite everywhere. The same buffers, settings,
-    threads and machine give the same bits. Ctrl-C during the training of the network ends it early with what
-    was reached.
+    threads and machine give the same bits, but for a time budget. Ctrl-C once the network is in training ends
+    the fit early with what was reached.
 
     ``candidates`` are further guesses at the clean image, made by somebody else (another denoiser, say, or
     the previous frame moved into place): pairs of linear radiance in the shape of the colour, one image for

@@ -94,13 +94,23 @@ def fit_fusion(
                 else ()
             )
         )
-        if threads == 1:
-            wait([whole_pilots])
-        steps = settings.iterations or preset.steps
-        training = train(network, start, settings, steps, preset.batch_pixels, started, progress)
+        try:
+            if threads == 1:
+                wait([whole_pilots])
+            steps = settings.iterations or preset.steps
+            training = train(network, start, settings, steps, preset.batch_pixels, started, progress)
+        except BaseException:
+            given_up.set()
+            raise
         if training.interrupted:
             given_up.set()
-        images = whole_pilots.result()
+        try:
+            images = whole_pilots.result()
+        except KeyboardInterrupt:
+            given_up.set()
+            images = ()
+            training.interrupted = True
+            training.notes.append("interrupted: the image is made of the halves alone")
     shape = evidence.mean.shape
     halves = [start.examples.of_half(half) for half in (0, 1)]
     fused = of_both_halves(lambda half: network.fuse(halves[half]).reshape(shape), threads)

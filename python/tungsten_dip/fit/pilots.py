@@ -208,14 +208,25 @@ def guidance_of_halves(
             emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
             smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
             if emission.any():
-                # The pre-filter blurs long edges of bright lights, the mean along edges their corners.
-                along = _along_edges(emission, EDGES.radius, features, penalty, threads)
-                smooth_emission = np.float32(0.5) * (smooth_emission + along)
+                smooth_emission = _smooth_emission(emission, smooth_emission, features, penalty, threads)
         left_out = {name: float(planes[name][0][0, 0]) for name in flat}
         guidance.append(
             Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, threads)
         )
     return tuple(guidance)
+
+
+def _smooth_emission(
+    emission: FloatImage,
+    filtered: FloatImage,
+    features: FloatImage,
+    penalty: tuple[float, ...],
+    threads: int,
+) -> FloatImage:
+    """The pre-filter blurs long edges of bright lights, the mean along edges their corners."""
+    along = _along_edges(emission, EDGES.radius, features, penalty, threads)
+    smooth: FloatImage = np.float32(0.5) * (filtered + along)
+    return smooth
 
 
 def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Literal, get_args, get_origin, get_type_hints
 
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
@@ -21,6 +22,11 @@ PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 """What the preset ``paper`` alone leaves open."""
 
 
+_WHOLE_NUMBERS = (("iterations", 1, 10**9), ("seed", 0, (1 << 63) - 1), ("threads", 1, 1024))
+_MOST_SCALES = 8
+_MOST_CHANNELS = 4096
+
+
 @dataclass(frozen=True)
 class FitSettings:
     """Settings of one fit. None means: as the preset has it.
@@ -30,7 +36,7 @@ class FitSettings:
     describe the network of the published method and are used by the preset ``paper`` alone. ``target_error``
     is a relMSE (epsilon 0.01). ``threads`` None uses every core.
 
-    Raises InputError if a number is out of its range.
+    Raises InputError if a name is none of those listed, or a number out of its range.
     """
 
     preset: Preset = "balanced"
@@ -47,14 +53,29 @@ class FitSettings:
     pilot: Literal["none", "oidn"] = "none"
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "time_budget_s", "target_error", "threads"):
+        for name, hint in get_type_hints(FitSettings).items():
+            if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
+                raise InputError(
+                    f"{name}: expected {', '.join(get_args(hint))}, got {getattr(self, name)!r:.40}"
+                )
+        for name, least, most in _WHOLE_NUMBERS:
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise InputError(f"{name}: expected a number above 0, got {value}")
-        if not self.channels or any(count < 1 for count in self.channels):
+            if value is not None and not _is_whole(value, least, most):
+                raise InputError(f"{name}: expected a whole number from {least} to {most}, got {value!r:.40}")
+        for name in ("time_budget_s", "target_error"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, Real) and float(value) > 0):
+                raise InputError(f"{name}: expected a number above 0, got {value!r:.40}")
+        counts = self.channels
+        if not 0 < len(counts) <= _MOST_SCALES or not all(_is_whole(n, 1, _MOST_CHANNELS) for n in counts):
             raise InputError(
-                f"channels: expected positive counts such as 8,16,32,64,128, got {self.channels}"
+                f"channels: expected at most {_MOST_SCALES} counts from 1 to {_MOST_CHANNELS}, such as "
+                f"8,16,32,64,128, got {counts!r:.40}"
             )
+
+
+def _is_whole(value: object, least: int, most: int) -> bool:
+    return isinstance(value, Integral) and least <= int(value) <= most
 
 
 @dataclass(frozen=True)
@@ -73,10 +94,11 @@ class FitResult:
     ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE
     (with epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error
     around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
-    half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their
-    mean (but for fireflies). These are None where the buffers hold no independent evidence. ``model`` is
-    the fitted network, None where there was none to fit. ``interrupted`` tells that Ctrl-C ended the fit
-    early. ``notes`` says in one line each what evidence was missing and what that meant.
+    half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their mean
+    with the preset draft, and with the others moved from it towards what all samples say. These are None
+    where the buffers hold no independent evidence. ``model`` is the fitted network, None where there was none
+    to fit. ``interrupted`` tells that Ctrl-C ended the fit early. ``notes`` says in one line each what
+    evidence was missing and what that meant.
     """
 
     color: FloatImage

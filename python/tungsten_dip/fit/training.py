@@ -127,18 +127,18 @@ def first_weights(layout: Layout, seed: int) -> Weights:
 
 
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
-    """Yield ``size`` of both halves' examples at a time, or all if they are fewer, without end.
+    """Yield ``size`` of both halves' examples at a time, or as many as there are, without end.
 
-    ``trained`` are the pixels that they may show.
+    ``trained`` are the pixels that they may show. They are drawn with replacement: small images over-fit if
+    every step sees all of them.
     """
     count, pixels = 2 * len(trained), len(examples.inputs) // 2
-    drawn = min(_POOL_PIXELS, count)
-    size = min(size, drawn)
+    size = min(size, count)
     while True:
-        half, index = np.divmod(rng.choice(count, drawn, replace=False), len(trained))
+        half, index = np.divmod(rng.integers(count, size=max(_POOL_PIXELS, size)), len(trained))
         pool = examples.at(half * pixels + trained[index])
         for _ in range(_POOL_PASSES):
-            for end in range(size, drawn + 1, size):
+            for end in range(size, len(pool.inputs) + 1, size):
                 yield pool.part(end - size, end)
 
 

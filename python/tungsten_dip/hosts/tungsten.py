@@ -202,21 +202,34 @@ def render_to_folder(arguments: Sequence[str]) -> int:
     return 0
 
 
+_INTERRUPTED = (130, -signal.SIGINT)
+"""How a child ends that Ctrl-C reached as well."""
+
+
 def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) -> RenderBuffers:
     command = _require_executable()
     given = {name: value for name, value in asdict(options).items() if name in ("spp", "seed", "threads")}
     read_end, write_end = os.pipe()
-    with tempfile.TemporaryDirectory() as folder, os.fdopen(read_end) as lines:
-        child = subprocess.Popen(
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        os.fdopen(read_end) as lines,
+        subprocess.Popen(
             [command, "--dip-render-buffers", folder, str(write_end), str(scene), json.dumps(given)],
             env=_environment(),
             pass_fds=[write_end],
-        )
+        ) as child,
+    ):
         os.close(write_end)
-        for line in lines:
-            fraction, _, message = line.rstrip("\n").partition(" ")
-            progress(float(fraction), message)
-        status = child.wait()
+        try:
+            for line in lines:
+                fraction, _, message = line.rstrip("\n").partition(" ")
+                progress(float(fraction), message)
+            status = child.wait()
+        except BaseException:
+            child.terminate()
+            raise
+        if status in _INTERRUPTED:
+            raise KeyboardInterrupt
         if status:
             error = Path(folder, "error")
             raise InputError(

@@ -42,10 +42,11 @@ _RUN_PIXELS = 1 << 13
 def infer(
     model: Model,
     buffers: RenderBuffers,
-    threads: int | None = None,
     progress: Progress = silent,
-    candidates: Sequence[Halves] = (),
+    *,
+    threads: int | None = None,
     refit_steps: int = 0,
+    candidates: Sequence[Halves] = (),
     previous: Halves | None = None,
 ) -> FitResult:
     """Denoise one image with a fitted network, by onnxruntime alone.

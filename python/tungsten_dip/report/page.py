@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import FEATURES, FloatImage, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
 from tungsten_dip.report import parts
 from tungsten_dip.report.parts import Picture
@@ -73,7 +73,7 @@ def _in_range(values: FloatImage) -> FloatImage:
 def _subtitle(buffers: RenderBuffers) -> str:
     size = f"{buffers.width} x {buffers.height} pixels"
     spp = "" if buffers.spp is None else f", {float(np.mean(buffers.spp)):g} samples per pixel"
-    features = [name for name, _ in buffers.quantities() if name != "color"]
+    features = [name for name, _ in buffers.quantities() if name in FEATURES]
     return f"{size}{spp}, guided by {', '.join(features) or 'the colour alone'}"
 
 

@@ -9,7 +9,6 @@ nowhere.
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import re
 from collections import Counter
@@ -22,6 +21,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.json_file import object_from_json_file, shown
 from tungsten_dip.scene.metals import ETA_AND_K
 from tungsten_dip.scene.transforms import matrix_from_transform
 from tungsten_dip.scene.types import (
@@ -92,79 +92,12 @@ def load_scene(path: Path | str, input_directory: Path | str | None = None) -> S
     remedy.
     """
     path = Path(path)
-    raw = _json_from_file(path)
+    raw = object_from_json_file(path)
     folder = Path(input_directory) if input_directory is not None else path.parent
     try:
         return _Parser(path, folder).scene(raw)
     except RecursionError:
         raise InputError(f"{path}: objects are nested too deeply; flatten the scene") from None
-
-
-def _json_from_file(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8-sig") if path.is_file() else None
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: expected JSON in UTF-8, got byte {error.start} that is not; re-save it"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); check the path and the permissions") from None
-    if text is None:
-        found = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{path}: expected a Tungsten scene file, found {found}; check the path")
-
-    repeated: set[str] = set()
-
-    def first_of_equal_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        fields: dict[str, Any] = {}
-        for key, value in pairs:
-            if key in fields:
-                repeated.add(key)
-            else:
-                fields[key] = value
-        return fields
-
-    try:
-        raw = json.loads(_plain_json(text), object_pairs_hook=first_of_equal_keys)
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}:{error.lineno}:{error.colno}: expected JSON, got a syntax error ({error.msg}); "
-            "correct that line"
-        ) from None
-    except RecursionError:
-        raise InputError(f"{path}: JSON is nested too deeply; flatten the scene") from None
-    except ValueError as error:
-        raise InputError(
-            f"{path}: expected JSON, got a number of too many digits ({error}); shorten it"
-        ) from None
-    if not isinstance(raw, dict):
-        raise InputError(f"{path}: expected a JSON object with primitives and a camera, got {_short(raw)}")
-    if repeated:
-        listed = ", ".join(sorted(_short(key) for key in repeated))
-        logger.warning("%s: keys that appear twice in one object, the first is used: %s", path, listed[:500])
-    return raw
-
-
-def _plain_json(text: str) -> str:
-    """Blank out comments and trailing commas, which Tungsten allows, keeping every line and column."""
-
-    def blank(match: re.Match[str]) -> str:
-        token = match.group()
-        return token if token.startswith('"') else re.sub(r"[^\n]", " ", token)
-
-    string = r'"(?:[^"\\]|\\.)*"?'
-    text = re.sub(rf"{string}|//[^\n]*|/\*(?:.*?\*/|.*)", blank, text, flags=re.DOTALL)
-    return re.sub(rf"{string}|,(?=\s*[}}\]])", blank, text, flags=re.DOTALL)
-
-
-def _short(value: object) -> str:
-    """Show a value of the file on one line, whatever its size."""
-    if isinstance(value, dict):
-        return "an object"
-    if isinstance(value, list):
-        return f"an array of {len(value)}"
-    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 10**40 else "a huge number"
-    return text if len(text) <= 60 else text[:57] + '..."'
 
 
 def _types_by_name(family: type[Any]) -> dict[str, type[Any]]:
@@ -221,7 +154,7 @@ class _Parser:
         self.ignored: Counter[str] = Counter()
 
     def fail(self, where: str, expected: str, got: object, remedy: str) -> InputError:
-        return InputError(f"{self.path}: {where}: expected {expected}, got {_short(got)}; {remedy}")
+        return InputError(f"{self.path}: {where}: expected {expected}, got {shown(got)}; {remedy}")
 
     def scene(self, raw: dict[str, Any]) -> Scene:
         """Read the parts in Tungsten's order: a name must be declared before it is used."""
@@ -238,7 +171,7 @@ class _Parser:
                             self.path,
                             key,
                             index,
-                            _short(item.name),
+                            shown(item.name),
                         )
                     self.named[family].setdefault(item.name, item)
             parts[key] = tuple(items)
@@ -250,7 +183,7 @@ class _Parser:
             parts["renderer"] = self.fields(Renderer, raw["renderer"], "renderer")
         if isinstance(parts.get("camera"), ThinlensCamera):
             parts["camera"] = self.focused(parts["camera"], parts["primitives"])
-        self.ignored.update(_short(key)[1:-1] for key in raw if key not in parts and key not in _HARMLESS)
+        self.ignored.update(shown(key)[1:-1] for key in raw if key not in parts and key not in _HARMLESS)
         if self.ignored:
             listed = ", ".join(key if n == 1 else f"{key} ({n} times)" for key, n in self.ignored.items())
             logger.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
@@ -433,7 +366,7 @@ class _Parser:
         for key in value:
             if key not in known and key not in harmless:
                 # One line for all elements of an array.
-                self.ignored[re.sub(r"\[\d+\]", "[]", f"{where}.") + _short(key)[1:-1]] += 1
+                self.ignored[re.sub(r"\[\d+\]", "[]", f"{where}.") + shown(key)[1:-1]] += 1
 
     def settle(self, cls: type, parts: dict[str, Any], where: str) -> None:
         if issubclass(cls, Camera):
@@ -495,7 +428,7 @@ class _Parser:
     def primitive_named(self, name: str, primitives: tuple[Primitive, ...], where: str) -> Primitive | None:
         found = next((primitive for primitive in primitives if primitive.name == name), None)
         if found is None:
-            logger.warning("%s: %s: no primitive is named %s; ignored", self.path, where, _short(name))
+            logger.warning("%s: %s: no primitive is named %s; ignored", self.path, where, shown(name))
         return found
 
 

@@ -114,7 +114,7 @@ class Follower:
         return replace(followed, result=replace(result, notes=(*mended, *result.notes)))
 
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
-        alone = buffers.with_quantities(normal=None, depth=None, visibility=None)
+        alone = buffers.with_quantities(normal=None, depth=None)
         return buffers.with_quantities(albedo=prefilter_features(alone, self._settings.threads).albedo)
 
     def _follow(
@@ -135,7 +135,9 @@ class Follower:
             steps = _MOST_STEPS if self._refit == "auto" else self._refit
             threads = self._settings.threads
             try:
-                result = inference.infer(model, buffers, threads, progress, refit_steps=steps, previous=moved)
+                result = inference.infer(
+                    model, buffers, progress, threads=threads, refit_steps=steps, previous=moved
+                )
             except InputError as problem:
                 raise _CutError(str(problem)) from problem
         elif moved is not None:

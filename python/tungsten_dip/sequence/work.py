@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
+from importlib import metadata
 from typing import Any
 
 import OpenEXR
@@ -37,12 +38,17 @@ _NOT_OF_THE_IMAGE = ("threads", "device")
 
 @dataclass(frozen=True)
 class Run:
-    """What holds for all frames of a run. ``half`` stores pictures as 16-bit floats."""
+    """What holds for all frames of a run.
+
+    ``half`` stores pictures as 16-bit floats. ``warm_start`` is the SHA-256 of the file of the model that the
+    first frame starts from, if any.
+    """
 
     settings: FitSettings = field(default_factory=FitSettings)
     refit: Refit = "auto"
     mapping: dict[str, str] = field(default_factory=dict)
     half: bool = False
+    warm_start: str | None = None
 
 
 @dataclass(frozen=True)
@@ -154,7 +160,7 @@ def failed(frame: Frame, error: Exception) -> Record:
 
 
 def _key(frame: Frame, run: Run) -> str:
-    """Return what tells whether a result is of this input and these settings.
+    """Return what tells whether a result is of this input, these settings and this version.
 
     Raises InputError if the input is missing.
     """
@@ -166,7 +172,8 @@ def _key(frame: Frame, run: Run) -> str:
     except OSError as error:
         raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
     settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
-    facts: list[Any] = [stats, settings, run.refit, run.mapping, run.half]
+    asked = (settings, run.refit, run.mapping, run.half, run.warm_start)
+    facts: list[Any] = [stats, *asked, metadata.version("tungsten-dip")]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 

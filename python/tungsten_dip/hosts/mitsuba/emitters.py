@@ -14,8 +14,6 @@ from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, largest_value
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
 
-_CAP_ROWS = 16384  # of the map of an infinite_sphere_cap: its edge is this sharp over 180 degrees
-
 # Mitsuba's azimuth in an environment map starts at -z and Tungsten's at -x.
 _ENVMAP_AXES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -52,7 +50,7 @@ def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
         return {"type": "constant", "radiance": constant(_scaled(texture.value, scale))}
     if isinstance(texture, ts.BitmapTexture) and texture.interpolate:
         pixels = bitmap_pixels(t, texture, "rgb") * (scale * texture.scale)
-        return envmap_node(pixels, _rotation(primitive.world_from_local), clamp=texture.clamp)
+        return envmap_node(pixels, _rotation(t, primitive.world_from_local), clamp=texture.clamp)
     raise t.unsupported(f"an infinite_sphere with a texture of type {texture.kind} (or not interpolated)")
 
 
@@ -93,23 +91,15 @@ def envmap_node(
 def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node:
     if not isinstance(texture, ts.ConstantTexture):
         raise t.unsupported(f"an infinite_sphere_cap with a texture of type {texture.kind}")
-    matrix = primitive.world_from_local
-    for other in t.source.primitives:
-        if primitive.skydome and other.name == primitive.skydome:
-            matrix = other.world_from_local
     angle = math.radians(primitive.cap_angle)
-    radiance = np.asarray(texture.value, dtype=np.float64)
-    if primitive.power is not None:
-        radiance = radiance / (2.0 * math.pi * (1.0 - math.cos(angle)))
-    # The cap lies about the pole of the map, whose rows are as fine as its edge needs to be.
-    edge = angle / math.pi * (_CAP_ROWS - 1)
-    rows = np.clip(edge - np.arange(_CAP_ROWS) + 0.5, 0.0, 1.0)
-    axis = matrix[:3, 1] / np.linalg.norm(matrix[:3, 1])
-    helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.5 else np.array([0.0, 0.0, 1.0])
-    x = np.cross(axis, helper)
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, axis, np.cross(x, axis)], axis=1)
-    return _envmap(np.repeat((rows[:, None] * radiance)[:, None, :], 4, axis=1), rotation)
+    solid_angle = 4.0 * math.pi * math.sin(angle / 2.0) ** 2
+    scale = 1.0 / solid_angle if primitive.power is not None else 1.0
+    return {
+        "type": "tungsten_cap",
+        "direction": [float(x) for x in primitive.world_from_local[:3, 1]],
+        "cap_angle": angle,
+        "radiance": constant(_scaled(texture.value, scale)),
+    }
 
 
 def _envmap(rows: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64]) -> Node:
@@ -122,8 +112,11 @@ def _envmap(rows: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64]) ->
     }
 
 
-def _rotation(matrix: Matrix) -> npt.NDArray[np.float64]:
-    return np.asarray(matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0))
+def _rotation(t: Translation, matrix: Matrix) -> npt.NDArray[np.float64]:
+    axes = np.asarray(matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0))
+    if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-3):
+        raise t.unsupported("a sheared transform")
+    return axes
 
 
 def _scaled(value: ts.Vec3, scale: float) -> ts.Vec3:

@@ -46,7 +46,7 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
         node["medium"] = medium_object(t, camera.medium)
     if isinstance(camera, ts.PinholeCamera) or camera.aperture_size == 0.0:
         return {"type": "perspective", **node}
-    lens = {"aperture_radius": camera.aperture_size, "focus_distance": _focus_distance(t, camera)}
+    lens = {"aperture_radius": camera.aperture_size, "focus_distance": camera.focus_distance}
     return {"type": "thinlens", **node, **lens}
 
 
@@ -76,16 +76,6 @@ def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
         lens["lens_radius"] = camera.aperture_size
         lens["diaphragm_distance"] = camera.cateye * plane_distance
     return lens
-
-
-def _focus_distance(t: Translation, camera: ts.ThinlensCamera) -> float:
-    if camera.focus_pivot:
-        for primitive in t.source.primitives:
-            if primitive.name == camera.focus_pivot:
-                return float(
-                    np.linalg.norm(primitive.world_from_local[:3, 3] - camera.world_from_local[:3, 3])
-                )
-    return camera.focus_distance
 
 
 def _rigid(t: Translation, matrix: ts.Matrix) -> ts.Matrix:

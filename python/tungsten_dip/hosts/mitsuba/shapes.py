@@ -108,6 +108,9 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     if area == 0.0:
         return []
     emission = emission_node(t, primitive, area)
+    if emission:
+        # Mitsuba's lights shine about their shading normals, Tungsten's about those of their faces.
+        normals = None
     materials = np.clip(mesh.materials, 0, len(primitive.bsdf) - 1)
     parts = [(bsdf, materials == number) for number, bsdf in enumerate(primitive.bsdf)]
     if any(height_map(bsdf) for bsdf in primitive.bsdf):
@@ -143,7 +146,7 @@ def _quad(t: Translation, primitive: ts.Quad) -> Any:
 
 
 def _cube(t: Translation, primitive: ts.Cube) -> Any:
-    centre, rotation, scale = _parts(primitive.world_from_local)
+    centre, rotation, scale = _parts(t, primitive.world_from_local)
     corner_uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions: list[_Array] = []
     triangles: list[npt.NDArray[Any]] = []
@@ -169,20 +172,22 @@ def _cube(t: Translation, primitive: ts.Cube) -> Any:
 
 
 def _sphere(t: Translation, primitive: ts.Sphere) -> Node:
-    centre, rotation, scale = _parts(primitive.world_from_local)
+    centre, rotation, scale = _parts(t, primitive.world_from_local)
     radius = float(scale.max())
     # Half a turn about z brings Mitsuba's azimuth, which starts at +x, to Tungsten's, which starts at -x.
     axes = radius * (rotation @ np.diag([-1.0, -1.0, 1.0]))
     return {
         "type": "sphere",
         "to_world": transform(_affine(axes, centre)),
+        # Mirrored, Mitsuba's sphere would be one that is seen from within.
+        "flip_normals": bool(np.linalg.det(rotation) < 0.0),
         **_surroundings(t, primitive, primitive.bsdf),
         **emission_node(t, primitive, 4.0 * math.pi * radius**2),
     }
 
 
 def _disk(t: Translation, primitive: ts.Disk) -> Node:
-    centre, rotation, scale = _parts(primitive.world_from_local)
+    centre, rotation, scale = _parts(t, primitive.world_from_local)
     radius = float(max(scale[0], scale[2]))
     emission = emission_node(t, primitive, math.pi * radius**2, _DISK_UV)
     if emission and primitive.cone_angle != 90.0:
@@ -198,7 +203,7 @@ def _disk(t: Translation, primitive: ts.Disk) -> Node:
 
 
 def _cylinder(t: Translation, primitive: ts.Cylinder) -> list[Node]:
-    centre, rotation, scale = _parts(primitive.world_from_local)
+    centre, rotation, scale = _parts(t, primitive.world_from_local)
     radius, height = 0.5 * float(max(scale[0], scale[2])), float(scale[1])
     x, y, z = rotation.T
     # Tungsten counts the caps whether they are there or not.
@@ -253,10 +258,10 @@ def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
         )
         shapes = {f"shape_{number}": shape for number, shape in enumerate(_shapes(t, bare))}
         groups.append(t.add("shapegroup", {"type": "shapegroup", **shapes}))
-    _, rotation, _ = _parts(primitive.world_from_local)
+    _, rotation, _ = _parts(t, primitive.world_from_local)
     nodes = []
     for placement in primitive.instances:
-        origin, turn, _ = _parts(placement.world_from_local)
+        origin, turn, _ = _parts(t, placement.world_from_local)
         place = (primitive.world_from_local @ np.append(origin, 1.0))[:3]
         to_world = transform(_affine(rotation @ turn, place))
         group = {"type": "ref", "id": groups[placement.id]}
@@ -295,10 +300,14 @@ def _triangles(
     return mesh
 
 
-def _parts(matrix: Matrix) -> tuple[_Array, _Array, _Array]:
+def _parts(t: Translation, matrix: Matrix) -> tuple[_Array, _Array, _Array]:
     """Return position, unit axes (as columns) and their lengths, as Tungsten takes a matrix apart."""
     scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    return matrix[:3, 3], matrix[:3, :3] / scale, scale
+    with np.errstate(invalid="ignore"):  # of an axis without length there is nothing to see
+        axes = matrix[:3, :3] / scale
+    if abs(axes.T @ axes - np.diag(np.diagonal(axes.T @ axes))).max() > 1e-3:
+        raise t.unsupported("a sheared transform")
+    return matrix[:3, 3], axes, scale
 
 
 def _affine(axes: _Array, origin: _Array) -> Matrix:

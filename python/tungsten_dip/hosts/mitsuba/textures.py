@@ -6,6 +6,7 @@ bitmap without interpolation ignores its scale: all of that is kept.
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any, Literal
 
@@ -26,6 +27,8 @@ from tungsten_dip.scene.types import (
     Vec3,
 )
 
+_LOG = logging.getLogger(__name__)
+
 Request = Literal["rgb", "average", "alpha_or_average"]
 """What is asked of a texture: its colour, the mean of it, or its alpha channel where it has one."""
 
@@ -36,6 +39,7 @@ _Texels = npt.NDArray[Any]
 
 _GAMMA = np.floor(255.0 * (np.arange(256) / 255.0) ** 2.2 + 1e-9) / 255.0
 _HDR_SUFFIXES = {".exr", ".pfm", ".hdr"}
+_ALWAYS_WITH_ALPHA = {".png", ".jpg", ".jpeg"}  # Tungsten decodes these to four channels, whatever they hold
 _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade textures
 
 
@@ -177,5 +181,8 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
         return _GAMMA[rgb] if texture.gamma_correct else rgb / 255.0
     if request == "alpha_or_average" and alpha is not None:
         return alpha.astype(np.float64) / (1.0 if hdr else 255.0)
+    if request == "alpha_or_average" and texture.file.suffix.lower() in _ALWAYS_WITH_ALPHA:
+        _LOG.warning("%s: holds no alpha: as in Tungsten, nothing of it is transparent", texture.file)
+        return np.ones((*pixels.shape[:2], 1))
     total: _Texels = rgb.astype(np.float64).sum(axis=2, keepdims=True) / 3.0
     return total if hdr else np.floor(total) / 255.0
