@@ -402,6 +402,13 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     assert capfd.readouterr().err.splitlines()[-1] == "tungsten: interrupted"
 
 
+def test_scenes_that_would_write_over_one_another_are_refused(tmp_path, renders, capfd):
+    scenes = [write_scene(tmp_path / name) for name in ("a.json", "b.json")]
+    assert tungsten.main(["--dip-denoise", "--host", "mitsuba", *map(str, scenes)]) != 0
+    assert "b.json: would write over" in capfd.readouterr().err
+    assert len(list(tmp_path.glob("*_denoised.exr"))) == 1
+
+
 def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, capfd, monkeypatch):
     calls = []
 

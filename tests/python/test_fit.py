@@ -623,3 +623,47 @@ def test_batches_show_all_that_is_trained_on_and_nothing_else(
         np.testing.assert_array_equal(batch.wanted, batch.inputs)
         seen |= set(batch.inputs.ravel().tolist())
     assert seen == {*trained, *(pixels + trained)}
+
+
+@pytest.mark.parametrize("spoil", ["sums", "another picture"])
+def test_halves_of_another_picture_are_left_aside(spoil: str, render: SyntheticRender) -> None:
+    color = render.buffers.color
+    assert color.half_a is not None
+    assert color.half_b is not None
+    halves = {
+        "sums": (color.half_a / 2, color.half_b / 2),
+        "another picture": (
+            np.ascontiguousarray(color.half_a[::-1]),
+            np.ascontiguousarray(color.half_b[::-1]),
+        ),
+    }[spoil]
+    buffers = render.buffers.with_quantities(color=Buffer(color.mean, *halves, color.variance))
+    result = denoise(buffers, _settings())
+    _check(result, buffers)
+    assert any("another picture" in note for note in result.notes)
+    assert result.estimated_relmse is None
+    assert result.color.mean() == pytest.approx(color.mean.mean(), rel=0.05)
+
+
+def test_halves_of_unequal_size_are_used(render: SyntheticRender) -> None:
+    color = render.buffers.color
+    assert color.half_a is not None
+    assert color.half_b is not None
+    mean = (2 * color.half_a + color.half_b) / 3
+    buffers = render.buffers.with_quantities(color=Buffer(mean, color.half_a, color.half_b))
+    assert denoise(buffers, _settings()).estimated_relmse is not None
+
+
+def test_a_colour_without_a_sane_pixel_is_refused(render: SyntheticRender) -> None:
+    nothing = np.full_like(render.buffers.color.mean, np.nan)
+    with pytest.raises(InputError, match="in every pixel"):
+        denoise(render.buffers.with_quantities(color=Buffer(nothing)), _settings())
+
+
+def test_small_images_are_no_worse_for_more_pilots(make_render: MakeRender) -> None:
+    errors = []
+    for preset in ("draft", "balanced"):
+        renders = [make_render(64, 36, seed=seed) for seed in range(3)]
+        results = [denoise(r.buffers, FitSettings(preset, threads=1)).color for r in renders]
+        errors.append(np.mean([_rel_mse(c, r.reference) for c, r in zip(results, renders, strict=True)]))
+    assert errors[1] < 1.1 * errors[0]

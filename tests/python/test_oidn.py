@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 
+from tungsten_dip.buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, oidn
 
@@ -100,3 +101,11 @@ def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
 def test_as_a_pilot_it_must_be_installed(render, without_pyoidn):
     with pytest.raises(InputError, match=r"tungsten-dip\[oidn\]"):
         denoise(render.buffers, FitSettings(pilot="oidn"))
+
+
+def test_without_halves_it_is_the_result(render):
+    buffers = render.buffers.with_quantities(color=Buffer(render.buffers.color.mean))
+    result = denoise(buffers, FitSettings(pilot="oidn", threads=1))
+    np.testing.assert_allclose(result.color, np.maximum(image(render), 0), rtol=1e-5)
+    assert result.estimated_relmse is None
+    assert any("that of Open Image Denoise" in note for note in result.notes)

@@ -99,9 +99,8 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     failures = [record for record in records if record.error is not None]
     if failures:
         numbers_of = ", ".join(str(record.number) for record in failures)
-        raise InputError(
-            f"{len(failures)} of {len(records)} frames have no result: {numbers_of}; the others are done"
-        )
+        rest = "" if len(failures) == len(records) else "; the others are done"
+        raise InputError(f"{len(failures)} of {len(records)} frames have no result: {numbers_of}{rest}")
     seconds = sum(record.seconds for record in records)
     facts = {"frames": [asdict(record) for record in records]}
     return facts, f"{len(records)} frames, denoised in {seconds:.1f} s in all"

@@ -116,12 +116,13 @@ def _run(arguments: Sequence[str] | None) -> None:
 
         follower = Follower(settings, models=Models(first=warm_start))
     failed = 0
+    denoised: set[Path] = set()
     for index, path in enumerate(options.scenes):
         # The same noise in every frame would not average out.
         seed = options.seed if index == 0 or follower is None else (options.seed or 0) + index
         of_frame = argparse.Namespace(**{**vars(options), "seed": seed})
         try:
-            _render_scene(path, host, of_frame, settings, warm_start, follower)
+            _render_scene(path, host, of_frame, settings, warm_start, follower, denoised)
         except InputError as error:
             if len(options.scenes) == 1:
                 raise
@@ -178,10 +179,14 @@ def _render_scene(
     settings: FitSettings,
     warm_start: Model | None,
     follower: Follower | None,
+    denoised: set[Path],
 ) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
 
-    With ``follower``, the scene is one of several frames.
+    With ``follower``, the scene is one of several frames. ``denoised`` are the denoised pictures of the
+    scenes before, to which this one's are added.
+
+    Raises InputError if the scene would write over one of those, or as whatever is called here does.
     """
     scene = load_scene(path, options.input_directory)
     if options.output_directory is not None:
@@ -197,6 +202,12 @@ def _render_scene(
     outputs.check()
     if options.dip_denoise:
         for derived in _denoised_paths(outputs):
+            if derived in denoised:
+                raise InputError(
+                    f"{path}: would write over {derived}, which belongs to a scene before; give every scene "
+                    f"an output_file of its own"
+                )
+            denoised.add(derived)
             check_writable(derived, (derived.suffix,))
     if options.report is not None:
         check_writable(options.report, (".html",))

@@ -64,6 +64,8 @@ def _run(arguments: Sequence[str] | None) -> None:
             emit(facts)
         else:
             print(text)
+    if facts.get("interrupted"):
+        raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -137,6 +139,8 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     settings = fit_settings(options, names, warm_start)
     if fixed and settings.preset != "paper":
         raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
+    if settings.preset == "paper" and options.error_map is not None:
+        raise InputError("--error-map: the published method knows no error; choose another preset")
     return _denoised(options, lambda buffers: denoise_with_progress(buffers, settings, warm_start))
 
 
@@ -188,6 +192,7 @@ def _denoised(
         "estimated_relmse": result.estimated_relmse,
         "settings": asdict(result.settings),
         "history": [asdict(point) for point in result.history],
+        "interrupted": result.interrupted,
         "notes": list(result.notes),
     }
     known = result.estimated_relmse is not None

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
+import numpy as np
+
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
@@ -64,6 +66,8 @@ def denoise(
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
+    if not np.isfinite(buffers.color.mean).any():
+        raise InputError("the colour: expected radiance, found NaN and Inf in every pixel; render it again")
     if settings.preset == "paper":
         require_torch()
     if settings.pilot == "oidn":

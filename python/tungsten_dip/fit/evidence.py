@@ -47,6 +47,13 @@ _BRIGHTEST = 1e15
 _ONLY_PILOT = Pilot(9, k=1.0)
 """Used alone where nothing can score the pilots."""
 
+_UNEQUAL = 0.5
+"""Halves of one and two samples are so far apart from the mean of all three, in units of half their
+difference, with room to spare."""
+
+_ROUNDED = 2e-3
+"""Relative difference that rounding to 16 bits explains."""
+
 _CONVERGED = 1e-5
 """relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
@@ -218,20 +225,23 @@ def evidence_from_buffers(
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
     test = halves_independent(buffers, settings.threads)
-    if color.half_a is None or color.half_b is None or not test.independent:
+    if color.half_a is None or color.half_b is None or not test.independent or not _halves_belong(color):
         if _converged(color, scale):
             notes.append("the halves agree to within a few thousandths: the image is returned as it is")
             image = color.mean.copy()
         else:
-            notes.append(_why_no_halves(buffers, test))
-            if candidates or previous is not None or settings.pilot != "none":
+            notes.append(_why_no_halves(buffers, test, settings.pilot))
+            if candidates or previous is not None:
                 notes.append("the candidates are not used: nothing can score them")
-            colors = (_scaled(color.mean, scale),)
-            guidance = guidance_of_halves(buffers, colors, scale, threads)
-            progress(0.2, "features")
-            guides = first_guides(colors, variance, guidance)
-            (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
-            image = unscaled(image, scale)
+            if settings.pilot == "oidn":
+                image = _oidn_mean(buffers, color.mean, settings.threads)
+            else:
+                colors = (_scaled(color.mean, scale),)
+                guidance = guidance_of_halves(buffers, colors, scale, threads)
+                progress(0.2, "features")
+                guides = first_guides(colors, variance, guidance)
+                (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
+                image = unscaled(image, scale)
         seconds = time.perf_counter() - started
         progress(1.0, "one pilot")
         history = (HistoryPoint(seconds, 0, None),)
@@ -318,8 +328,7 @@ def pilots_of_all_samples(
         computed.append(maker.images(pilot)[0] * something)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
-        image = oidn_image(evidence.mean / np.float32(evidence.scale), albedo, normal, threads=threads)
+        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), threads)
         handed_in[-1] = np.maximum(_scaled(image, evidence.scale), 0)
     return (evidence.mean, *computed, *handed_in)
 
@@ -365,6 +374,12 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     if name in guidance.names:
         return guidance.features[:, :, guidance.names.index(name)]
     return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
+
+
+def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
+    """What Open Image Denoise makes of all samples."""
+    albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
+    return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
 
 
 def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: int | None) -> Halves:
@@ -461,8 +476,23 @@ def _exposure(color: FloatImage) -> float:
     return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
 
 
-def _why_no_halves(buffers: RenderBuffers, test: _core.HalvesTest) -> str:
-    tail = "nothing can score the result: one pilot is used, without an estimate of its error"
+def _halves_belong(color: Buffer) -> bool:
+    """Whether the colour is the mean of its halves, but for rounding and for halves of unequal size."""
+    assert color.half_a is not None
+    assert color.half_b is not None
+    a, b = color.half_a.astype(np.float64), color.half_b.astype(np.float64)
+    apart = np.median(abs((a + b) / 2 - color.mean))
+    noise, level = np.median(abs(a - b) / 2), np.median(abs(color.mean))
+    return bool(apart <= _UNEQUAL * noise + _ROUNDED * level)
+
+
+def _why_no_halves(buffers: RenderBuffers, test: _core.HalvesTest, pilot: str) -> str:
+    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "one pilot is used"
+    tail = f"nothing can score the result: {used}, without an estimate of its error"
     if not buffers.color.has_halves:
         return f"no half buffers: {tail}"
+    if test.independent:
+        return f"the half buffers are those of another picture than the colour: {tail}"
+    if not np.isfinite(test.correlation):
+        return f"the image is too small or too plain to tell whether its halves are independent: {tail}"
     return f"the half buffers are not independent (correlation {test.correlation:.2f}): {tail}"

