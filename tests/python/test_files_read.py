@@ -98,6 +98,23 @@ RENDERERS = {
             "depth": ["ViewLayer.Denoising Depth.Z"],
         },
     ),
+    "blender, a view layer of the background without features": (
+        [
+            *rgb("BG.Combined"),
+            *rgb("ViewLayer.Combined"),
+            *rgb("ViewLayer.Denoising Albedo"),
+            *xyz("ViewLayer.Denoising Normal"),
+        ],
+        {
+            "color": rgb("ViewLayer.Combined"),
+            "albedo": rgb("ViewLayer.Denoising Albedo"),
+            "normal": xyz("ViewLayer.Denoising Normal"),
+        },
+    ),
+    "blender, features of another view layer": (
+        [*rgb("A.Combined"), *rgb("A.Mist"), *rgb("A.Env"), *rgb("A.Emit"), *rgb("B.DiffCol")],
+        {"color": rgb("A.Combined")},
+    ),
     "blender, two view layers": (
         [
             *rgb("Back.Normal"),
@@ -106,7 +123,7 @@ RENDERERS = {
             *rgb("Back.Combined"),
             *rgb("Back.Denoising Albedo"),
         ],
-        {"color": rgb("Front.Noisy Image"), "albedo": rgb("Front.DiffCol"), "normal": rgb("Back.Normal")},
+        {"color": rgb("Front.Noisy Image"), "albedo": rgb("Front.DiffCol")},
     ),
     "arnold": (
         [

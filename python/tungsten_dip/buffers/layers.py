@@ -120,8 +120,15 @@ def _layers(names: list[str]) -> Layers:
     return layers
 
 
+_COMPOSITE = "composite."
+
+
 def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] | None:
-    """Find the best layer, and what stands before the alias in its name (a Blender view layer)."""
+    """Find the best layer, and what stands before the alias in its name (a Blender view layer).
+
+    Of several view layers the colour is that of the one which holds most; features of another one than the
+    colour's show something else.
+    """
     matches = []
     for order, layer in enumerate(layers):
         name = layer.lower()
@@ -131,10 +138,13 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] 
             if name == alias or (alias and name.endswith("." + alias)):
                 prefix = name[: len(name) - len(alias)]
                 # Blender's "Composite" is what its compositor made, perhaps graded already.
-                strange = prefix == "composite." if quantity == "color" else prefix != color_prefix
-                matches.append((strange, rank, order, layer, prefix))
+                strange = prefix == _COMPOSITE if quantity == "color" else prefix != color_prefix
+                if strange and prefix and color_prefix not in ("", _COMPOSITE):
+                    break
+                held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
+                matches.append((strange, rank, -held, order, layer, prefix))
                 break
-    return min(matches)[3:] if matches else None
+    return min(matches)[4:] if matches else None
 
 
 def _may_be_color(layer: str, layers: Layers) -> bool:

@@ -2,9 +2,8 @@
 
 A pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
 window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`), or it sees the
-colour alone. Each half of the
-samples is denoised from its own samples alone: what one half's pilots predict is scored by the other half,
-whose noise they have never seen.
+colour alone. Each half of the samples is denoised from its own samples alone: what one half's pilots predict
+is scored by the other half, whose noise they have never seen.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class GraphBuilder:
     def constant(self, name: str, value: npt.NDArray[Any]) -> str:
         """Add an initializer, unless there is one of that name, and return the name."""
         if name not in self._initializers:
-            # Raw bytes, whatever the size, as `file` reads them.
+            # Raw bytes, whatever the size, so that files can be compared.
             little_endian = np.ascontiguousarray(value).astype(value.dtype.newbyteorder("<"), copy=False)
             self._initializers[name] = helper.make_tensor(
                 name,
