@@ -72,11 +72,15 @@ def test_the_page_shows_frames_and_curves(frames):
     assert not re.search(r'(src|href)="(?!data:)', page)
 
 
-def test_finished_frames_are_skipped_and_changed_ones_are_not(frames):
+def test_finished_frames_are_skipped_and_changed_ones_are_not(frames, capsys):
     assert main(arguments()) == 0
     first = outputs(frames)
+    capsys.readouterr()
     assert main(arguments()) == 0
     assert outputs(frames) == first
+    told = capsys.readouterr()
+    assert told.out.startswith("0 frames, denoised in 0.0 s in all; ")
+    assert told.err.count("finished already") == len(first)
     os.utime(frames / "noisy/f0001/color.exr", ns=(1, 1))
     (frames / "out/f0002.exr").write_bytes(first["f0002.exr"][:1000])
     assert main(arguments()) == 0

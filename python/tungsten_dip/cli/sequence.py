@@ -101,9 +101,11 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         numbers_of = ", ".join(str(record.number) for record in failures)
         rest = "" if len(failures) == len(records) else "; the others are done"
         raise InputError(f"{len(failures)} of {len(records)} frames have no result: {numbers_of}{rest}")
-    seconds = sum(record.seconds for record in records)
+    done = [record for record in records if not record.skipped]
+    seconds = sum(record.seconds for record in done)
     facts = {"frames": [asdict(record) for record in records]}
-    return facts, f"{len(records)} frames, denoised in {seconds:.1f} s in all"
+    before = "" if len(done) == len(records) else f"; {len(records) - len(done)} were finished before"
+    return facts, f"{len(done)} frames, denoised in {seconds:.1f} s in all{before}"
 
 
 @contextmanager
@@ -121,7 +123,9 @@ def _without_repetition() -> Iterator[None]:
 
 
 def _tell(record: Record) -> None:
-    if record.error is None:
+    if record.skipped:
+        log.info("frame %d: finished already: %s", record.number, record.output)
+    elif record.error is None:
         log.info(
             "frame %d: %s, %d steps, %.1f s: %s",
             record.number, record.how, record.iterations, record.seconds, record.output,

@@ -55,7 +55,8 @@ class Run:
 class Record:
     """What became of a frame. ``how`` is as in `following.Followed`; ``error`` says why there is no result.
 
-    ``seconds`` is all that the frame took but for writing it.
+    ``seconds`` is all that the frame took but for writing it. ``skipped``: it was finished
+    before.
     """
 
     number: int
@@ -66,6 +67,7 @@ class Record:
     estimated_relmse: float | None = None
     flicker: float | None = None
     error: str | None = None
+    skipped: bool = False
 
 
 def finished(frame: Frame, run: Run) -> Record | None:
@@ -80,7 +82,7 @@ def finished(frame: Frame, run: Run) -> Record | None:
         stored = json.loads(OpenEXR.File(str(frame.output), header_only=True).parts[0].header[_RECORD])
         if stored.pop("key") != key:
             return None
-        return Record(**{**stored, "number": frame.number, "output": str(frame.output)})
+        return Record(**{**stored, "number": frame.number, "output": str(frame.output), "skipped": True})
     except (AttributeError, IndexError, KeyError, OSError, RuntimeError, TypeError, ValueError):
         return None
 
