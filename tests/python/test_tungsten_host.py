@@ -392,3 +392,12 @@ def test_the_native_command_runs_the_package_and_fails_in_one_line(tmp_path):
     assert result.returncode == 2
     assert "missing.json" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@in_process
+def test_evidence_that_is_taken_is_gone(write_scene):
+    session = tungsten._load(write_scene(), tungsten.DriverOptions(spp=1))
+    session.take_evidence()
+    for again in (session.take_evidence, session.evidence):
+        with pytest.raises(RuntimeError):
+            again()
