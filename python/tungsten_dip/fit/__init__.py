@@ -66,8 +66,8 @@ def denoise(
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
-    if not np.isfinite(buffers.color.mean).any():
-        raise InputError("the colour: expected radiance, found NaN and Inf in every pixel; render it again")
+    if not any(np.isfinite(plane).any() for _, plane in buffers.color.planes()):
+        _LOG.warning("the colour is NaN or Inf in every pixel: the picture will be black; render it again")
     if settings.preset == "paper":
         require_torch()
     if settings.pilot == "oidn":
