@@ -67,7 +67,9 @@ def denoise(
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     if not any(np.isfinite(plane).any() for _, plane in buffers.color.planes()):
-        _LOG.warning("the colour is NaN or Inf in every pixel: the picture will be black; render it again")
+        _LOG.warning(
+            "the colour is NaN or Inf in every pixel: the picture will show next to nothing; render it again"
+        )
     if settings.preset == "paper":
         require_torch()
     if settings.pilot == "oidn":
