@@ -329,7 +329,7 @@ def pilots_of_all_samples(
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), threads)
-        handed_in[-1] = np.maximum(_scaled(image, evidence.scale), 0)
+        handed_in[-1] = _scaled(image, evidence.scale)
     return (evidence.mean, *computed, *handed_in)
 
 
@@ -377,7 +377,7 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
 
 
 def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
-    """What Open Image Denoise makes of all samples."""
+    """What Open Image Denoise makes of all samples, never negative."""
     albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
     return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
 

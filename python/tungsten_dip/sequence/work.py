@@ -55,8 +55,7 @@ class Run:
 class Record:
     """What became of a frame. ``how`` is as in `following.Followed`; ``error`` says why there is no result.
 
-    ``seconds`` is all that the frame took but for writing it. ``skipped``: it was finished
-    before.
+    ``seconds`` is all that the frame took but for writing it. ``skipped``: it was finished before.
     """
 
     number: int
