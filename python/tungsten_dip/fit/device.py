@@ -29,11 +29,8 @@ def compute_device(settings: FitSettings) -> Iterator[torch.device]:
         torch.set_num_threads(threads_before)
 
 
-def convolutions_in_bfloat16(device: torch.device) -> torch.autocast:
-    """Return a context in which torch's convolutions take bfloat16, where the processor computes with it.
-
-    Sums stay in float32, and so do weights. Elsewhere the context changes nothing.
-    """
+def convolution_dtype(device: torch.device) -> torch.dtype:
+    """Return bfloat16 where the processor computes with it, else float32."""
     capabilities: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     native = bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
-    return torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cpu" and native)
+    return torch.bfloat16 if device.type == "cpu" and native else torch.float32

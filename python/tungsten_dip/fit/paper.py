@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.device import compute_device, convolutions_in_bfloat16
+from tungsten_dip.fit.device import compute_device, convolution_dtype
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, Weights, check_planes, check_settings, source_sha256
 from tungsten_dip.fit.networks import ResNet, Skip
@@ -57,19 +57,21 @@ class PaperFit:
         self._last_good_psnr = -math.inf
         generator = torch.Generator().manual_seed(settings.seed)
 
+        # Rounding to bfloat16 is far below the noise that every iteration adds to the input. Sums stay in
+        # float32, and so do weights.
+        dtype = convolution_dtype(device)
+        self._precision = torch.autocast(device.type, dtype, enabled=dtype != torch.float32)
         fixed = torch.from_numpy(network_input(images, settings.seed))
         channels = fixed.shape[2]
-        self._input = _nchw(fixed.to(device))
+        self._input = _nchw(fixed.to(device, dtype))
         self._noisy_input = torch.empty_like(self._input)
         # Drawing every value anew would cost more than the network's first layer. The noise of an iteration
         # is a window of this pool at a place drawn anew, so that no pixel sees the same value twice but by
         # chance.
         pool_size = fixed.numel() + _NOISE_WINDOWS * _NOISE_STRIDE
-        self._noise_pool = torch.randn(pool_size, generator=generator).to(device)
+        self._noise_pool = torch.randn(pool_size, generator=generator).to(device, dtype)
         self._generator = generator
 
-        # Rounding is far below the noise that every iteration adds to the input.
-        self._precision = convolutions_in_bfloat16(device)
         self._wanted = _nchw(torch.from_numpy(images.wanted).to(device))
         self._average: Tensor | None = None
         with torch.random.fork_rng(devices=[]):
