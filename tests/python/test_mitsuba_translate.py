@@ -137,6 +137,8 @@ BSDFS: dict[str, Json] = {
     "transparency": {"type": "transparency", "alpha": "alpha.png", "base": GREY},
     "mixed": {"type": "mixed", "ratio": "colour.png", "bsdf0": GREY, "bsdf1": {"type": "rough_conductor"}},
     "mixed with plastic": {"type": "mixed", "albedo": 0.7, "bsdf0": {"type": "smooth_coat"}, "bsdf1": GREY},
+    "mixed with a mirror": {"type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY},
+    "mixed with glass": {"type": "mixed", "bsdf0": GREY, "bsdf1": {"type": "dielectric"}},
     "null": {"type": "null"},
     "forward": {"type": "forward"},
 }
@@ -751,7 +753,7 @@ REFUSED: dict[str, Json] = {
     "smooth_coat over a BSDF that transmits": surface(
         {"type": "smooth_coat", "substrate": {"type": "dielectric"}}
     ),
-    "specular part": surface({"type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY}),
+    "mixed BSDF of a thinsheet": surface({"type": "mixed", "bsdf0": {"type": "thinsheet"}, "bsdf1": GREY}),
     "two smooth layers": surface(
         {"type": "mixed", "bsdf0": {"type": "plastic"}, "bsdf1": {"type": "plastic"}}
     ),
@@ -805,3 +807,14 @@ def test_a_broken_image_is_one_line_that_names_it(folder: Path) -> None:
     with pytest.raises(InputError, match=r"broken\.png") as error:
         render(folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": "broken.png"}}])
     assert "\n" not in str(error.value)
+
+
+def test_what_is_approximated_is_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = folder / "scene.json"
+    scene = surface({"name": "varnish", "type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY})
+    path.write_text(json.dumps({"camera": {"type": "pinhole", "resolution": [8, 8]}, **scene}))
+    with mitsuba_variant():
+        translate(load_scene(path))
+    assert len(caplog.messages) == 1
+    for part in (str(path), 'bsdf "varnish"', "(mirror)", "--host tungsten"):
+        assert part in caplog.messages[0]

@@ -5,12 +5,15 @@ Tungsten turns a BSDF that does not transmit towards the viewer, which Mitsuba's
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, Literal
 
 from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, slopes_node, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant
 from tungsten_dip.scene import types as ts
+
+_LOG = logging.getLogger(__name__)
 
 _WHITE = (1.0, 1.0, 1.0)
 _SMALLEST_ALPHA = 1e-3  # Tungsten clamps roughness here
@@ -248,9 +251,15 @@ def _diffuse_transmission(t: Translation, bsdf: ts.DiffuseTransmissionBsdf, uv: 
 def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
     parts = (bsdf.bsdf0, bsdf.bsdf1)
     for part in parts:
-        if not _scatters(part):
+        if isinstance(part, ts.MirrorBsdf | ts.ConductorBsdf | ts.DielectricBsdf):
             # Tungsten's light samples and BSDF samples disagree about the share of the other part.
-            raise t.unsupported(f"a mixed BSDF with a specular part ({part.kind})")
+            _LOG.warning(
+                "%s: %s: a mixed BSDF with a specular part (%s) is darker than Tungsten's by up to a sixth; "
+                "for the same picture render with --host tungsten",
+                t.source.path, t.place, part.kind,
+            )  # fmt: skip
+        elif not _scatters(part):
+            raise t.unsupported(f"a mixed BSDF of a {part.kind}")
     if all(isinstance(part, ts.PlasticBsdf | ts.SmoothCoatBsdf) for part in parts):
         raise t.unsupported("a mixed BSDF of two smooth layers")
     return {
