@@ -61,6 +61,28 @@ def test_examples_are_read_without_a_warning(path, caplog):
     assert not caplog.records
 
 
+MISSING = {"name": "rug", "type": "lambert", "albedo": "rug.png"}
+
+
+def test_a_missing_file_is_no_error_where_nothing_uses_it(load, caplog):
+    coat = {"name": "coat", "type": "smooth_coat", "substrate": "rug"}
+    grid = {"name": "smoke", "type": "voxel", "grid": {"type": "vdb", "file": "smoke.vdb"}}
+    scene = load({"media": [grid], "bsdfs": [MISSING, coat, {"name": "wall", "type": "lambert"}]})
+    assert [bsdf.name for bsdf in scene.bsdfs] == ["wall"]
+    assert not scene.media
+    assert len(caplog.messages) == 3
+    assert all("found none at" in message and "nothing uses it" in message for message in caplog.messages)
+
+
+def test_a_missing_file_is_an_error_where_it_is_used(load):
+    second = {"name": "rug", "type": "lambert"}
+    for bsdfs in ([MISSING], [MISSING, second]):
+        with pytest.raises(InputError, match=r"bsdfs\[0\].albedo: expected a file, found none"):
+            load({"bsdfs": bsdfs, "primitives": [{"type": "sphere", "bsdf": "rug"}]})
+    with pytest.raises(InputError, match=r"name: expected a text"):
+        load({"bsdfs": [{**MISSING, "name": []}]})
+
+
 def test_there_are_examples():
     assert [path.parent.name for path in EXAMPLES] == ["cornell-box", "fog", "glass", "textures"]
 

@@ -143,6 +143,10 @@ _FIELDS_BY_KEY = {
 }
 
 
+class _MissingFileError(InputError):
+    """A file that the scene names is not there."""
+
+
 class _Parser:
     """The state of one reading: what can be named so far, and what was ignored."""
 
@@ -150,6 +154,7 @@ class _Parser:
         self.path = path
         self.folder = folder
         self.named: dict[type, dict[str, Any]] = {Bsdf: {}, Medium: {}}
+        self.missing: list[_MissingFileError] = []
         self.nested_bsdfs: dict[Bsdf, int] = {}
         self.ignored: Counter[str] = Counter()
 
@@ -162,18 +167,24 @@ class _Parser:
         for key, family in (("media", Medium), ("bsdfs", Bsdf), ("primitives", Primitive)):
             items = []
             for index, value in enumerate(self.array(raw.get(key, []), key)):
-                item: Any = self.typed(family, value, f"{key}[{index}]")
-                items.append(item)
-                if family in self.named and item.name:
-                    if item.name in self.named[family]:
+                where = f"{key}[{index}]"
+                item: Any
+                try:
+                    item = self.typed(family, value, where)
+                    name = item.name
+                    items.append(item)
+                except _MissingFileError as missing:
+                    # No error unless something uses it: `reference` raises it then.
+                    if family not in self.named:
+                        raise
+                    item, name = missing, value.get("name", "")
+                    self.missing.append(missing)
+                if family in self.named and name:
+                    if name in self.named[family]:
                         logger.warning(
-                            "%s: %s[%d]: the name %s is taken; the first is used",
-                            self.path,
-                            key,
-                            index,
-                            shown(item.name),
+                            "%s: %s: the name %s is taken; the first is used", self.path, where, shown(name)
                         )
-                    self.named[family].setdefault(item.name, item)
+                    self.named[family].setdefault(name, item)
             parts[key] = tuple(items)
         parts["primitives"] = self.with_suns_aimed(parts["primitives"])
         for key, single in (("camera", Camera), ("integrator", Integrator)):
@@ -187,6 +198,8 @@ class _Parser:
         if self.ignored:
             listed = ", ".join(key if n == 1 else f"{key} ({n} times)" for key, n in self.ignored.items())
             logger.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
+        for error in self.missing:
+            logger.warning("%s (ignored: nothing uses it)", error)
         return Scene(path=self.path, raw=raw, **parts)
 
     # --- Values by annotation ---
@@ -277,7 +290,7 @@ class _Parser:
         except (OSError, ValueError):
             exists = False
         if not exists:
-            raise InputError(
+            raise _MissingFileError(
                 f"{self.path}: {where}: expected a file, found none at {str(path)!r:.300}; "
                 "put it there or correct the name"
             )
@@ -317,7 +330,10 @@ class _Parser:
             raise self.fail(
                 where, f"the name of a {_FAMILIES[family]}", name, f"declare it in {what}, before its use"
             )
-        return self.named[family][name]
+        found = self.named[family][name]
+        if isinstance(found, _MissingFileError):
+            raise found
+        return found
 
     # --- Objects ---
 
