@@ -22,7 +22,6 @@ class CMakeBuild(build_ext):
             [
                 "cmake", "-S", root, "-B", build_dir, "-G", "Ninja", "-DCMAKE_BUILD_TYPE=Release",
                 f"-DPython_EXECUTABLE={sys.executable}", f"-DTUNGSTEN_DIP_PACKAGE_DIR={package_dir}",
-                f"-DTUNGSTEN_DIP_VERSION={self.distribution.get_version()}",
             ]
         )  # fmt: skip
         jobs = os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL", str(os.cpu_count() or 1))

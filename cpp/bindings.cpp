@@ -109,25 +109,6 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
                           py::make_tuple(defects.mean, defects.half_a, defects.half_b, defects.variance));
 }
 
-Array halves_variance_array(const py::array& half_a, const py::array& half_b, int threads) {
-    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, std::nullopt);
-    Array out = array_like(buffer.half_a);
-    const Image image = image_from_array("out", out);
-    const py::gil_scoped_release release;
-    halves_variance(buffer.half_a, buffer.half_b, image, threads);
-    return out;
-}
-
-Array calibrate_variance_array(const py::array& variance, const py::array& half_a, const py::array& half_b,
-                               int threads) {
-    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
-    Array out = array_like(buffer.half_a);
-    const Image image = image_from_array("out", out);
-    const py::gil_scoped_release release;
-    calibrate_variance(buffer.variance, buffer.half_a, buffer.half_b, image, threads);
-    return out;
-}
-
 HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_b,
                                  const OptionalArray& variance, int threads) {
     const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
@@ -215,7 +196,6 @@ Array smooth_along_edges_array(const py::array& image, const py::array& features
 PYBIND11_MODULE(_core, module) {
     using namespace tungsten_dip;  // NOLINT(google-build-using-namespace): a scope of declarations alone
     module.doc() = "The core of tungsten-dip in C++. _core.pyi documents it; use tungsten_dip.buffers.";
-    module.attr("__version__") = TUNGSTEN_DIP_VERSION;
 
     py::class_<Defects>(module, "Defects")
         .def_readonly("nan", &Defects::nan)
@@ -230,10 +210,6 @@ PYBIND11_MODULE(_core, module) {
 
     module.def("sanitize", &sanitize, py::arg("quantity"), py::arg("mean"), py::arg("half_a"),
                py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
-    module.def("halves_variance", &halves_variance_array, py::arg("half_a"), py::arg("half_b"),
-               py::arg("threads") = 0);
-    module.def("calibrate_variance", &calibrate_variance_array, py::arg("variance"), py::arg("half_a"),
-               py::arg("half_b"), py::arg("threads") = 0);
     module.def("compare_halves", &compare_halves_arrays, py::arg("half_a"), py::arg("half_b"),
                py::arg("variance"), py::arg("threads") = 0);
     module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),

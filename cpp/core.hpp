@@ -100,11 +100,6 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 // The mean over a square window of (2 radius + 1)^2 pixels, clipped at the borders of the image.
 void box_mean(ConstImage in, int radius, Image out, int threads);
 
-// The sample variance scaled so that its local mean (21x21 pixels) is that of the halves' variance: the
-// former is the less noisy, but wrong by a factor where samples are not independent (Rousselle et al. 2012,
-// "Adaptive Rendering with Non-Local Means Filtering", on low-discrepancy samples).
-void calibrate_variance(ConstImage variance, ConstImage half_a, ConstImage half_b, Image out, int threads);
-
 // Whether the noise of two halves is independent, as everything that scores one half by the other assumes.
 struct HalvesTest {
     // Of the two halves' errors; NaN if nothing in the image tells.

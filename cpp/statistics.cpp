@@ -12,7 +12,6 @@
 namespace tungsten_dip {
 namespace {
 
-constexpr int calibration_radius = 10;  // 441 pixels: the halves' variance is known within 7%
 constexpr double unknown = std::numeric_limits<double>::quiet_NaN();
 
 // --- The correlation of the halves' errors
@@ -230,25 +229,6 @@ void box_mean(ConstImage in, int radius, Image out, int threads) {
         std::fill_n(sum, out.row_size(), 0.0F);
         for (int tap = begin; tap <= end; ++tap) add_to(sum, across.row(tap), out.row_size());
         for (std::ptrdiff_t i = 0; i < out.row_size(); ++i) sum[i] /= static_cast<float>(end - begin + 1);
-    });
-}
-
-void calibrate_variance(ConstImage variance, ConstImage half_a, ConstImage half_b, Image out, int threads) {
-    std::vector<float> pixels(2 * static_cast<std::size_t>(out.size()));
-    const Image local_sample{
-        .data = pixels.data(), .height = out.height, .width = out.width, .channels = out.channels};
-    const Image local_halves{.data = pixels.data() + out.size(),
-                             .height = out.height,
-                             .width = out.width,
-                             .channels = out.channels};
-    halves_variance(half_a, half_b, out, threads);
-    box_mean(out, calibration_radius, local_halves, threads);
-    box_mean(variance, calibration_radius, local_sample, threads);
-    parallel_for(out.height, threads, [&](int y) {
-        for (std::ptrdiff_t i = 0; i < out.row_size(); ++i) {
-            const float sample = local_sample.row(y)[i];
-            out.row(y)[i] = sample > 0 ? variance.row(y)[i] * (local_halves.row(y)[i] / sample) : 0;
-        }
     });
 }
 

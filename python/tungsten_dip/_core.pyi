@@ -9,8 +9,6 @@ from collections.abc import Sequence
 
 from tungsten_dip.buffers.model import FloatImage
 
-__version__: str
-
 class Defects:
     """How many values of an image no renderer can have meant."""
 
@@ -51,14 +49,6 @@ def sanitize(
     tuple[Defects, Defects, Defects, Defects],
 ]:
     """Return (mean, half_a, half_b, variance), copied and mended if defective, and all defects."""
-
-def halves_variance(half_a: FloatImage, half_b: FloatImage, threads: int = 0) -> FloatImage:
-    """Return (half_a - half_b)^2 / 4, an unbiased and very noisy estimate of the variance of the mean."""
-
-def calibrate_variance(
-    variance: FloatImage, half_a: FloatImage, half_b: FloatImage, threads: int = 0
-) -> FloatImage:
-    """Return the sample variance, scaled so that its 21x21 pixel mean is that of the halves' variance."""
 
 def compare_halves(
     half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0

@@ -59,22 +59,6 @@ void box_mean_is_clipped_at_borders() {
     CHECK(near(spread.at(3, 5), 25.0 / 15, 1e-5));
 }
 
-void calibration_finds_the_scale() {
-    Render render(48, 47, 8, 2, normal);
-    for (float& value : render.variance.values) value *= 2.2F;  // as Sobol samples overstate it
-    Pixels out(48, 47, 1);
-    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), out.view(), 0);
-    double sum = 0;
-    for (const float value : out.values) sum += value;
-    CHECK(near(sum / static_cast<double>(out.values.size()), 1.0 / 8, 0.1 / 8));
-
-    Pixels clean(3, 3, 1);
-    Pixels flat(3, 3, 1, 1.0F);
-    Pixels result(3, 3, 1, -1.0F);
-    calibrate_variance(clean.view(), flat.view(), flat.view(), result.view(), 1);
-    CHECK(result == clean);
-}
-
 HalvesTest compare(Render& render, bool with_variance) {
     return compare_halves(render.half_a.view(), render.half_b.view(),
                           with_variance ? render.variance.view() : Image{}, 0);
@@ -151,11 +135,6 @@ void threads_do_not_matter() {
         return compare_halves(render.half_a.view(), render.half_b.view(), render.variance.view(), threads);
     };
     CHECK(run(1).correlation == run(5).correlation && run(1).variance_ratio == run(5).variance_ratio);
-    Pixels one(67, 43, 1);
-    Pixels many(67, 43, 1);
-    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), one.view(), 1);
-    calibrate_variance(render.variance.view(), render.half_a.view(), render.half_b.view(), many.view(), 5);
-    CHECK(one == many);
 }
 
 }  // namespace
@@ -163,7 +142,6 @@ void threads_do_not_matter() {
 int main() {
     halves_variance_is_that_of_the_mean();
     box_mean_is_clipped_at_borders();
-    calibration_finds_the_scale();
     independent_halves_pass();
     mirrored_halves_fail();
     shared_samples_fail();

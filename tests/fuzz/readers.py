@@ -15,8 +15,9 @@ from tungsten_dip.buffers import read_buffers, write_denoised
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.scene.effects import inspect_facts
-from tungsten_dip.scene.meshes import TriangleMesh, read_curves, read_mesh, with_smooth_normals, write_wo3
+from tungsten_dip.scene.meshes import TriangleMesh, read_curves, read_mesh, with_smooth_normals
 from tungsten_dip.scene.parse import load_scene
+from wo3 import write_wo3
 
 _EXAMPLES = Path(__file__).parents[2] / "examples"
 

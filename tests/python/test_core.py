@@ -17,7 +17,6 @@ from tungsten_dip.buffers import (
     halves_independent,
     prefilter_features,
     sanitize,
-    variance_of_mean,
 )
 
 SIZES = [(1, 1), (1, 9), (9, 1), (7, 5), (65, 67), (0, 4), (4, 0)]
@@ -40,8 +39,6 @@ def _noisy_color(height: int, width: int, spp: int = 8, mirror: float = 0.0, see
 
 CALLS: list[Callable[[np.ndarray], object]] = [
     lambda array: _core.sanitize("color", array, None, None, None),
-    lambda array: _core.halves_variance(array, array),
-    lambda array: _core.calibrate_variance(array, array, array),
     lambda array: _core.compare_halves(array, array, None),
     lambda array: _core.prefilter_feature(array, array, array, None),
 ]
@@ -82,7 +79,7 @@ def test_shapes_must_agree() -> None:
     with pytest.raises(
         ValueError, match=r"half_b: expected the shape of the others, \(4, 5, 3\), got \(5, 4, 3\)"
     ):
-        _core.halves_variance(image, other)
+        _core.compare_halves(image, other, None)
     with pytest.raises(ValueError, match="variance: expected the shape"):
         _core.compare_halves(image, image, other)
     with pytest.raises(ValueError, match="quantity: expected color, albedo"):
@@ -197,17 +194,6 @@ def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
 
     alone = halves_independent(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
     assert (alone.independent, alone.pixels_used) == (False, 0)
-
-
-def test_variance_of_mean_uses_what_there_is() -> None:
-    mean, half_a, half_b, variance = (array for _, array in _noisy_color(40, 41).color.planes())
-    assert variance_of_mean(Buffer(mean)) is None
-    assert variance_of_mean(Buffer(mean, variance=variance)) is variance
-    from_halves = variance_of_mean(Buffer(mean, half_a, half_b))
-    np.testing.assert_allclose(from_halves, (half_a - half_b) ** 2 / 4, rtol=1e-6)
-    calibrated = variance_of_mean(Buffer(mean, half_a, half_b, 3 * variance))
-    assert calibrated is not None
-    assert calibrated.mean() == pytest.approx(1 / 8, rel=0.1)
 
 
 def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRender) -> None:

@@ -15,9 +15,9 @@ from tungsten_dip.scene.meshes import (
     read_curves,
     read_mesh,
     with_smooth_normals,
-    write_wo3,
 )
 from tungsten_dip.scene.types import Curves, Mesh
+from wo3 import write_wo3
 
 CUBE_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
 CUBE_TRIANGLES = np.array(

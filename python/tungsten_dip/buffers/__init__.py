@@ -7,7 +7,7 @@ from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, R
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.sanitize import sanitize
-from tungsten_dip.buffers.statistics import HalvesTest, halves_independent, variance_of_mean
+from tungsten_dip.buffers.statistics import HalvesTest, halves_independent
 from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 
 __all__ = [
@@ -25,7 +25,6 @@ __all__ = [
     "read_image",
     "replacing",
     "sanitize",
-    "variance_of_mean",
     "write_denoised",
     "write_image",
     "write_tungsten_folder",

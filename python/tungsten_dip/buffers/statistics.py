@@ -1,12 +1,12 @@
-"""What the halves of a render and its sample variance tell of its noise."""
+"""Whether the noise of a render's halves is independent."""
 
 from __future__ import annotations
 
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import RenderBuffers
 
-__all__ = ["HalvesTest", "halves_independent", "variance_of_mean"]
+__all__ = ["HalvesTest", "halves_independent"]
 
 
 def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
@@ -21,17 +21,3 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     if color.half_a is None or color.half_b is None:
         return HalvesTest()
     return _core.compare_halves(color.half_a, color.half_b, color.variance, threads or 0)
-
-
-def variance_of_mean(buffer: Buffer, threads: int | None = None) -> FloatImage | None:
-    """Estimate the variance of ``buffer.mean`` (same shape); None if neither halves nor variance are known.
-
-    With both, the sample variance is scaled to agree locally with the halves (Rousselle et al. 2012,
-    "Adaptive Rendering with Non-Local Means Filtering"); halves alone give an unbiased but very noisy
-    estimate.
-    """
-    if buffer.half_a is None or buffer.half_b is None:
-        return buffer.variance
-    if buffer.variance is None:
-        return _core.halves_variance(buffer.half_a, buffer.half_b, threads or 0)
-    return _core.calibrate_variance(buffer.variance, buffer.half_a, buffer.half_b, threads or 0)

@@ -126,16 +126,6 @@ def read_curves(path: Path) -> CurveSet:
     return curves
 
 
-def write_wo3(path: Path, mesh: TriangleMesh) -> None:
-    """Write a mesh as Tungsten's binary format."""
-    vertices = np.zeros(len(mesh.positions), _WO3_VERTEX)
-    vertices["position"], vertices["normal"], vertices["uv"] = mesh.positions, mesh.normals, mesh.uvs
-    triangles = np.zeros(len(mesh.triangles), _WO3_TRIANGLE)
-    triangles["vertices"], triangles["material"] = mesh.triangles, mesh.materials
-    counts = [np.array(len(array), "<u8").tobytes() for array in (vertices, triangles)]
-    path.write_bytes(counts[0] + vertices.tobytes() + counts[1] + triangles.tobytes())
-
-
 def with_smooth_normals(mesh: TriangleMesh) -> TriangleMesh:
     """Compute the vertex normals as Tungsten does: area-weighted, with edges kept where faces meet sharply.
 
