@@ -8,6 +8,8 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+from tungsten_dip.cores import thread_count
+
 PACKAGES = (
     "tungsten-dip",
     "onnxruntime",
@@ -35,7 +37,7 @@ def machine_facts(threads: int | None = None) -> list[tuple[str, str]]:
     facts = [
         ("processor", cpu_model()),
         ("cores", str(os.cpu_count())),
-        ("threads in use", str(threads or os.cpu_count())),
+        ("threads in use", str(thread_count(threads))),
         ("system", f"{platform.system()} {platform.release()}, Python {platform.python_version()}"),
     ]
     if find_spec("torch") is not None:
@@ -48,7 +50,7 @@ def machine_facts(threads: int | None = None) -> list[tuple[str, str]]:
 
 def machine_key(threads: int | None = None) -> str:
     """Return in a few words what must stay the same for two measurements to be of one kind."""
-    return f"{cpu_model()} with {threads or os.cpu_count()} threads"
+    return f"{cpu_model()} with {thread_count(threads)} threads"
 
 
 def _version(package: str) -> str | None:

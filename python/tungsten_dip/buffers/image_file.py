@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 from tungsten_dip.buffers.atomic import replacing
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.buffers.source import Channel, Part
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> 
     with (
         replacing(path) as temporary,
         temporary.open("wb") as stream,
-        _compressing(threads or os.cpu_count() or 1),
+        _compressing(thread_count(threads)),
     ):
         OpenEXR.File(encoded).write(stream)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import FEATURES, Buffer, RenderBuffers
+from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 0.35), (5, 0.5), (5, 0.7))
 """Radius of the window, and standard deviations that pixels may differ by: what one pass leaves is compared
@@ -29,7 +30,7 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
             mean, half_a, half_b, variance = feature.mean, feature.half_a, feature.half_b, feature.variance
             for radius, k in _PASSES:
                 mean, half_a, half_b, variance = _core.prefilter_feature(
-                    mean, half_a, half_b, variance, radius=radius, k=k, threads=threads or 0
+                    mean, half_a, half_b, variance, radius=radius, k=k, threads=thread_count(threads)
                 )
             if name != "normal":
                 # Where negative values were mended, the mean is not that of the halves, and may fall below 0.

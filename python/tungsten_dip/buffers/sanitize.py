@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.cores import thread_count
 
 _PLANES = ("", " half A", " half B", " variance")
 
@@ -23,7 +24,7 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
     lines = []
     for quantity, buffer in buffers.quantities():
         planes, defects = _core.sanitize(
-            quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, threads or 0
+            quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, thread_count(threads)
         )
         found = [
             f"{quantity}{plane} {_counts(counts)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
 from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.cores import thread_count
 
 __all__ = ["HalvesTest", "halves_independent"]
 
@@ -20,4 +21,4 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     color = buffers.color
     if color.half_a is None or color.half_b is None:
         return HalvesTest()
-    return _core.compare_halves(color.half_a, color.half_b, color.variance, threads or 0)
+    return _core.compare_halves(color.half_a, color.half_b, color.variance, thread_count(threads))

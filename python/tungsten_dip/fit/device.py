@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 
@@ -22,7 +22,7 @@ def compute_device(settings: FitSettings) -> Iterator[torch.device]:
         raise InputError("device cuda: expected one that torch can use, found none; use cpu or auto")
     use_cuda = settings.device != "cpu" and torch.cuda.is_available()
     threads_before = torch.get_num_threads()
-    torch.set_num_threads(settings.threads or os.cpu_count() or 1)
+    torch.set_num_threads(thread_count(settings.threads))
     try:
         yield torch.device("cuda" if use_cuda else "cpu")
     finally:

@@ -15,6 +15,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.statistics import halves_independent
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
@@ -220,7 +221,7 @@ def evidence_from_buffers(
         notes.append(f"no {', '.join(missing)}: edges are found with less evidence")
     color = buffers.color
     variance = None if color.variance is None else _scaled(_scaled(color.variance, scale), scale)
-    threads = settings.threads or 0
+    threads = thread_count(settings.threads)
     layout = pilots if isinstance(pilots, Layout) else None
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
@@ -300,7 +301,6 @@ def pilots_of_all_samples(
     buffers: RenderBuffers,
     settings: FitSettings,
     started: float,
-    threads: int,
     given_up: Event | None = None,
 ) -> tuple[FloatImage, ...]:
     """Return what the pilots make of all samples, with less noisy features and guides than a half's.
@@ -313,7 +313,7 @@ def pilots_of_all_samples(
     if settings.preset == "draft" or late:
         return ()
     colors = (evidence.mean,)
-    guidance = guidance_of_halves(buffers, colors, evidence.scale, threads)
+    guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.threads)
     a, b = evidence.halves
     variance = np.float32(0.25) * (a - b) ** 2
     guides = first_guides(colors, variance, guidance)
@@ -328,7 +328,7 @@ def pilots_of_all_samples(
         computed.append(maker.images(pilot)[0] * something)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), threads)
+        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
         handed_in[-1] = _scaled(image, evidence.scale)
     return (evidence.mean, *computed, *handed_in)
 

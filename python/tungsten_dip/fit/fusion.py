@@ -7,7 +7,6 @@ linear in the scored half, so noise adds a constant to the loss and nothing to t
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -75,10 +74,10 @@ def fit_fusion(
         # Those of draft are enough by themselves where there is no time for others.
         pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
     asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
-    threads = settings.threads or os.cpu_count() or 1
     evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     if isinstance(evidence, FitResult):
         return evidence
+    threads = evidence.threads
     start = start_of_training(evidence, settings.seed, warm_start)
     evidence = start.evidence
     network = PointwiseNetwork(
@@ -89,7 +88,7 @@ def fit_fusion(
     with ThreadPoolExecutor(1) as beside:
         whole_pilots = beside.submit(
             lambda: (
-                pilots_of_all_samples(evidence, buffers, settings, started, threads, given_up)
+                pilots_of_all_samples(evidence, buffers, settings, started, given_up)
                 if previous is None
                 else ()
             )

@@ -13,6 +13,7 @@ import numpy as np
 
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 
 _LOG = logging.getLogger(__name__)
@@ -67,7 +68,7 @@ def oidn_image(
         "high": pyoidn.OIDN_QUALITY_HIGH,
     }
     with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
-        device.set_int("numThreads", threads or 0)
+        device.set_int("numThreads", thread_count(threads))
         device.commit()
         with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT) as denoiser:
             for name, image in images.items():

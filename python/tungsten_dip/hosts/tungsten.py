@@ -25,6 +25,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress, silent
 
@@ -258,7 +259,7 @@ def _load(scene: Path, options: DriverOptions) -> Any:
     paths = {name: str(getattr(options, name) or "") for name in names}
     try:
         return module.Render(
-            str(scene), threads=options.threads or 0, spp=options.spp, seed=options.seed, **paths
+            str(scene), threads=thread_count(options.threads), spp=options.spp, seed=options.seed, **paths
         )
     except RuntimeError as error:
         raise InputError(

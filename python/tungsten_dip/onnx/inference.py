@@ -11,6 +11,7 @@ import numpy as np
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import (
     Array,
@@ -101,18 +102,18 @@ def _infer_fusion(
         return evidence
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
-        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started, settings.threads or 0)
-    fused, whole = _fused(model, evidence, whole_pilots, settings.threads or 0)
+        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
+    fused, whole = _fused(model, evidence, whole_pilots)
     result = result_from_fused(evidence, fused, whole, settings, started, 0, (), ())
     progress(1.0, "inferred")
     return replace(result, model=model)
 
 
 def _fused(
-    model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage], threads: int
+    model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage]
 ) -> tuple[Halves, FloatImage | None]:
     """Return what the network makes of both halves, and of all samples if given, band by band of rows."""
-    session = session_from_proto(graph_of(model, metadata={}), threads)
+    session = session_from_proto(graph_of(model, metadata={}), evidence.threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     rows_at_once = max(1, _RUN_PIXELS // width)
@@ -138,7 +139,7 @@ def _fused(
                     image[part] = _finite(color)[0].transpose(1, 2, 0)
         return fused
 
-    (half_a, *by_a), (half_b, *by_b) = of_both_halves(of_half, threads)
+    (half_a, *by_a), (half_b, *by_b) = of_both_halves(of_half, evidence.threads)
     whole = np.float32(0.5) * (by_a[0] + by_b[0]) if whole_pilots else None
     return (half_a, half_b), whole
 
@@ -151,7 +152,7 @@ def _infer_paper(
     check_planes(model, images.planes)
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
     # Norms of the whole image: no bands here.
-    session = session_from_proto(graph_of(model, metadata={}), settings.threads or 0)
+    session = session_from_proto(graph_of(model, metadata={}), thread_count(settings.threads))
     output = _finite(session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0])
     ldr = output[0, :3].transpose(1, 2, 0)
     color: FloatImage = np.ascontiguousarray(radiance_from_ldr(ldr))

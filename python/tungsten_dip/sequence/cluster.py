@@ -16,6 +16,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.sequence.following import Models
@@ -60,7 +61,7 @@ def denoise_on_cluster(
     for record in records:
         tell(record)
     if run.settings.threads is None:
-        share = max(1, (os.cpu_count() or 1) // workers) if scheduler == "local" else 1
+        share = max(1, thread_count(None) // workers) if scheduler == "local" else 1
         run = replace(run, settings=replace(run.settings, threads=share))
     shared = models or Models()
     if to_do:

@@ -7,7 +7,6 @@ independence of the halves and are not used.
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
@@ -139,7 +139,7 @@ def _scene_with_integrator(
     integrator = {
         "type": "tungsten_path",
         "quantities": " ".join(quantities),
-        "threads": threads or len(os.sched_getaffinity(0)),
+        "threads": thread_count(threads),
         "reconstruction_filter": translated.reconstruction_filter,
         "pixel_center": translated.pixel_center,
         **translated.lens,

@@ -1,0 +1,10 @@
+"""How many threads to use where nobody has said."""
+
+from __future__ import annotations
+
+import os
+
+
+def thread_count(threads: int | None) -> int:
+    """Return ``threads`` or, for None, one for each core that this process may run on."""
+    return threads or len(os.sched_getaffinity(0))
