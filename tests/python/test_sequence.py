@@ -12,7 +12,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
-from tungsten_dip.sequence.following import Follower
+from tungsten_dip.sequence.following import Follower, Models
 from tungsten_dip.sequence.frames import find_frames, numbers_from_text
 from tungsten_dip.sequence.reprojection import check_camera, reproject
 
@@ -273,6 +273,30 @@ def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path, make_render):
     follower.denoise(make_render(spp=4096).buffers)
     assert follower.denoise(make_render(spp=2, seed=1).buffers).how == "cut"
     assert follower.denoise(make_render(20, 30).buffers).how == "cut"
+
+
+def test_followed_frames_obey_the_settings(tmp_path):
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    first = Follower(DRAFT).denoise(frames[0].buffers).result.model
+    follower = Follower(replace(DRAFT, target_error=10.0), models=Models(first=first))
+    assert [follower.denoise(frame.buffers).result.iterations for frame in frames] == [1, 1]
+    with pytest.raises(InputError, match="fitted with preset draft, this fit asks for final"):
+        Follower(FitSettings("final"), models=Models(first=first))
+
+
+def test_a_frame_that_was_cut_short_is_no_cut(tmp_path):
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    model = Follower(DRAFT).denoise(frames[0].buffers).result.model
+    follower = Follower(DRAFT, models=Models(first=model))
+    follower.denoise(frames[0].buffers)
+    follower._error = 1e-12  # any error is so far above it that it tells of a cut
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("relMSE"):
+            raise KeyboardInterrupt
+
+    followed = follower.denoise(frames[1].buffers, progress=interrupt)
+    assert (followed.how, followed.result.interrupted) == ("followed", True)
 
 
 def test_frames_without_halves_are_denoised_each_by_itself(tmp_path):

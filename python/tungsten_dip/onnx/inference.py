@@ -13,6 +13,7 @@ from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import denoise
 from tungsten_dip.fit.evidence import (
     Array,
     Evidence,
@@ -22,7 +23,6 @@ from tungsten_dip.fit.evidence import (
     evidence_from_buffers,
     pilots_of_all_samples,
 )
-from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
@@ -61,21 +61,27 @@ def infer(
     Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
     refit_steps cannot be done.
     """
-    if buffers.color.mean.size == 0:
-        raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     if refit_steps < 0:
         raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
-    # A FitSettings checks the threads as well.
-    # The time budget was the fit's: what a network makes of an image must not depend on the machine's speed.
+    # When to stop was said of the model's own fit. (A FitSettings checks the threads as well.)
     settings = replace(
-        model.settings, threads=threads, iterations=refit_steps or None, time_budget_s=None, device="auto"
+        model.settings,
+        threads=threads,
+        iterations=refit_steps or None,
+        time_budget_s=None,
+        target_error=None,
+        device="auto",
     )
+    if model.layout is not None and refit_steps:
+        return denoise(
+            buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
+        )
+    if buffers.color.mean.size == 0:
+        raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, threads)
-    if model.layout is not None and refit_steps:
-        result = fit_fusion(buffers, settings, progress, given, model, previous)
-    elif model.layout is not None:
+    if model.layout is not None:
         result = _infer_fusion(model, buffers, settings, given, previous, progress)
     else:
         if refit_steps or given or previous is not None:

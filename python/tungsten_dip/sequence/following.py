@@ -19,7 +19,7 @@ from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.onnx import inference
 from tungsten_dip.progress import Progress, silent
@@ -76,11 +76,14 @@ class Follower:
     def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models | None = None) -> None:
         """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
 
-        Raises InputError if the settings are those of the published method, which has no halves to follow.
+        Raises InputError if the settings are those of the published method, which has no halves to follow, or
+        ask for another network than the first one's.
         """
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models or Models()
+        if self.models.first is not None:
+            check_settings(self.models.first, settings)
         self._settings = settings
         self._refit = refit
         self._last: _Last | None = None
@@ -133,11 +136,13 @@ class Follower:
         model = self.models.first if moved is None else self.models.following
         if model is not None:
             steps = _MOST_STEPS if self._refit == "auto" else self._refit
-            threads = self._settings.threads
             try:
-                result = inference.infer(
-                    model, buffers, progress, threads=threads, refit_steps=steps, previous=moved
-                )
+                if steps == 0:
+                    threads = self._settings.threads
+                    result = inference.infer(model, buffers, progress, threads=threads, previous=moved)
+                else:
+                    settings = replace(self._settings, iterations=steps)
+                    result = fit.denoise(buffers, settings, progress, warm_start=model, previous=moved)
             except InputError as problem:
                 raise _CutError(str(problem)) from problem
         elif moved is not None:
@@ -146,6 +151,8 @@ class Follower:
         else:
             return None
         error = _typical_error(result)
+        if result.interrupted:
+            error = None  # of a fit that was cut short
         if error is not None and self._error is not None and error > _CUT_ERROR * self._error:
             raise _CutError(f"the error is {error / self._error:.1f} times that of the previous frame")
         kept = result.model or model
