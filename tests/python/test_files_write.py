@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import random
 import string
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from tungsten_dip.buffers import (
@@ -268,6 +269,7 @@ OTHER = st.text(string.ascii_letters + string.digits + "._ ", min_size=1, max_si
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(names=["R", "r"], types=random.Random(0))
 @given(names=st.lists(NAME | OTHER, max_size=10, unique=True), types=st.randoms(use_true_random=False))
 def test_any_channel_names_survive(tmp_path: Path, names: list[str], types: object) -> None:
     names = list(dict.fromkeys([*names, "beauty.R", "beauty.G", "beauty.B"]))
@@ -395,9 +397,17 @@ def test_what_cannot_be_written_is_known_before(tmp_path: Path) -> None:
         (tmp_path / "none" / "a.exr", "cannot be written"),
         (tmp_path / "file" / "a.exr", "cannot be written"),
         (tmp_path / "folder.exr", "folder"),
+        (
+            tmp_path / f"{'n' * 245}.exr",
+            "cannot be written",
+        ),  # with room for the name itself, not for a temporary's
+        (tmp_path / f"{'n' * 300}.exr", "cannot be written"),
     ):
         with pytest.raises(InputError, match=message):
             check_writable(path)
+        if message == "cannot be written":
+            with pytest.raises(InputError, match=message):
+                write_image(path, noise((2, 2, 3)))
     assert sorted(tmp_path.iterdir()) == before
     for suffix in (".exr", ".png", ".gif"):
         with pytest.raises(InputError, match=r"cannot be written|ends in"):

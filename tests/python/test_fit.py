@@ -413,9 +413,10 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
 
 
 def test_progress_never_falls_and_ends_at_one(render: SyntheticRender) -> None:
-    for buffers in (render.buffers, RenderBuffers(Buffer(render.buffers.color.mean))):
+    without_halves = RenderBuffers(Buffer(render.buffers.color.mean))
+    for buffers, target in ((render.buffers, None), (render.buffers, 10.0), (without_halves, None)):
         told: list[float] = []
-        denoise(buffers, _settings(), lambda fraction, _, told=told: told.append(fraction))  # type: ignore[misc]
+        denoise(buffers, _settings(target_error=target), lambda fraction, _, told=told: told.append(fraction))  # type: ignore[misc]
         assert told == sorted(told)
         assert told[-1] == 1
 

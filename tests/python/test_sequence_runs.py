@@ -251,3 +251,32 @@ def test_a_scheduler_that_does_not_answer_is_one_line(frames, capsys, monkeypatc
     monkeypatch.setattr(module, "_CONNECT_TIMEOUT_S", 1)
     assert main(arguments("--scheduler", "tcp://127.0.0.1:9")) == 2
     assert "no scheduler answers" in capsys.readouterr().err
+
+
+def test_a_scheduler_without_workers_is_one_line(frames, capsys, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    from tungsten_dip.sequence import cluster as module
+
+    monkeypatch.setattr(module, "_CONNECT_TIMEOUT_S", 1)
+    with distributed.LocalCluster(
+        n_workers=0, processes=False, dashboard_address=None, protocol="tcp"
+    ) as local:
+        assert main(arguments("--scheduler", local.scheduler_address)) == 2
+    assert "has no worker; start one with: dask worker tcp://" in capsys.readouterr().err
+
+
+def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    from tungsten_dip.sequence import cluster as module
+
+    def first_alone(frames, run, models):
+        work.denoise_frames(frames[:1], run, models)
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(module, "denoise_frames", first_alone)
+    with distributed.LocalCluster(
+        n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as local:
+        assert main(arguments("--scheduler", local.scheduler_address)) == 2
+    assert "3 of 4 frames have no result: 1, 2, 3; the others are done" in capsys.readouterr().err
+    assert list(outputs(frames)) == ["f0000.exr"]

@@ -6,7 +6,6 @@ import fcntl
 import os
 import re
 import secrets
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,7 +24,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises InputError if the file system refuses (no such folder, read-only, full).
     """
     target = path.resolve()
-    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
+    temporary = _temporary(target)
     try:
         _remove_left_by_the_dead(target)
         with temporary.open("xb") as lock:
@@ -35,7 +34,8 @@ def replacing(path: Path) -> Iterator[Path]:
                 os.fsync(written.fileno())
             temporary.replace(target)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # such as that the name is too long to exist
+            temporary.unlink()
         if isinstance(error, OSError):
             raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
         raise
@@ -48,13 +48,18 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
-    if path.is_dir():
-        raise InputError(f"{path}: expected the name of a file, this is a folder")
     try:
-        with tempfile.TemporaryFile(dir=path.resolve().parent):
-            pass
+        if path.is_dir():
+            raise InputError(f"{path}: expected the name of a file, this is a folder")
+        temporary = _temporary(path.resolve())
+        temporary.open("xb").close()
+        temporary.unlink()
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
+
+
+def _temporary(target: Path) -> Path:
+    return target.with_name(f".{target.stem}-{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
 
 
 def _remove_left_by_the_dead(target: Path) -> None:

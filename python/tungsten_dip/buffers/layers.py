@@ -112,7 +112,9 @@ def _layers(names: list[str]) -> Layers:
         layer, _, component = name.rpartition(".")
         if not layer and component.upper() not in ("R", "G", "B", "A", "Y"):
             layer, component = name, ""  # a bare Z, depth or id is a layer by itself
-        layers.setdefault(layer, {})[component.upper()] = name
+        components = layers.setdefault(layer, {})
+        # Of two spellings one is right, in whatever order the file has them: R rather than r.
+        components[component.upper()] = min(name, components.get(component.upper(), name))
     for layer, components in list(layers.items()):
         if {"R", "G", "B"} <= components.keys():
             for component in components.keys() - {"R", "G", "B", "A"}:
@@ -130,7 +132,7 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] 
     colour's show something else.
     """
     matches = []
-    for order, layer in enumerate(layers):
+    for layer in layers:
         name = layer.lower()
         if name.startswith(_NO_LAYER) or not _ordered(layers[layer]):
             continue
@@ -142,9 +144,9 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] 
                 if strange and prefix and color_prefix not in ("", _COMPOSITE):
                     break
                 held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
-                matches.append((strange, rank, -held, order, layer, prefix))
+                matches.append((strange, rank, -held, layer, prefix))
                 break
-    return min(matches)[4:] if matches else None
+    return min(matches)[3:] if matches else None
 
 
 def _may_be_color(layer: str, layers: Layers) -> bool:

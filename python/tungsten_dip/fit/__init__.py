@@ -72,7 +72,7 @@ def denoise(
         )
     if settings.preset == "paper":
         require_torch()
-    if settings.pilot == "oidn":
+    elif settings.pilot == "oidn":
         require_oidn()
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)

@@ -137,4 +137,6 @@ def fit_fusion(
         layout=evidence.layout,
         standardisation=start.standardisation,
     )
+    if not training.interrupted:
+        progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
     return replace(result, model=model, interrupted=training.interrupted)

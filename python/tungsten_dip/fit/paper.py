@@ -212,6 +212,8 @@ def _notes_on_method(buffers: RenderBuffers, settings: FitSettings) -> list[str]
     clipped = float((buffers.color.mean > 1).any(axis=2).mean())
     if clipped:
         notes.append(f"{clipped:.2%} of the pixels exceed 1: the published method clips highlights")
+    if settings.pilot != "none":
+        notes.append("pilot is not used: the published method fits the colour alone")
     if settings.target_error is not None:
         notes.append("target_error is not used: the published method cannot tell its error")
     if settings.scheme == "ioc":

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 from tungsten_dip.cores import thread_count
@@ -106,7 +105,9 @@ def _done(
             records, found = task.result()
             yield records, found if task is first else None
         else:
-            yield [failed(frame, task.exception()) for frame in tasks[task]], None
+            # Frames that it had finished by then are there.
+            to_do, records = split_finished(tasks[task], run)
+            yield [*records, *(failed(frame, task.exception()) for frame in to_do)], None
 
 
 @contextmanager
@@ -134,17 +135,15 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
             f"{scheduler}: no scheduler answers ({error}); start one with: dask scheduler"
         ) from error
     with client:
-        client.wait_for_workers(1)
+        try:
+            client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT_S)
+        except TimeoutError as error:
+            raise InputError(
+                f"{scheduler}: the scheduler has no worker; start one with: dask worker {scheduler}"
+            ) from error
         yield client
 
 
 def _absolute(frame: Frame) -> Frame:
-    def absolute(path: Path) -> Path:
-        return path if path.is_absolute() else Path.cwd() / path
-
-    return Frame(
-        frame.number,
-        absolute(frame.input),
-        absolute(frame.output),
-        None if frame.scene is None else absolute(frame.scene),
-    )
+    scene = None if frame.scene is None else frame.scene.absolute()
+    return replace(frame, input=frame.input.absolute(), output=frame.output.absolute(), scene=scene)
