@@ -52,7 +52,7 @@ def fits(monkeypatch):
         progress(0.5, "halfway")
         color = np.broadcast_to(buffers.color.mean.mean((0, 1)), buffers.color.mean.shape).copy()
         error = np.full((buffers.height, buffers.width, 1), 0.25, np.float32)
-        known = buffers.color.has_halves
+        known = buffers.color.halves is not None
         return FitResult(
             color=color,
             settings=settings,
@@ -269,7 +269,10 @@ def test_inspect_buffers(folder, capfd):
         ("{", ["not JSON"]),
         ('{"primitives": [{"type": "quad", "bsdf": {"type": "velvet"}}]}', ["velvet"]),
         ('{"primitives": [{"type": "mesh", "file": "gone.obj", "bsdf": {"type": "lambert"}}]}', ["gone.obj"]),
-        ('{"bsdfs": [{"name": "wall", "type": "lambert", "albedo": "gone.png"}]}', ["gone.png"]),
+        (
+            '{"primitives": [{"type": "quad", "bsdf": {"type": "lambert", "albedo": "gone.png"}}]}',
+            ["gone.png"],
+        ),
         ('{"renderer": {"spp": 0}}', ["renderer.spp", "at least 1"]),
         ("[1, 2]", []),
         ("", ["syntax error"]),

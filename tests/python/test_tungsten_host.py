@@ -233,7 +233,7 @@ def test_other_integrators_give_colour_alone_and_say_so(write_scene, tmp_path, c
     with caplog.at_level(logging.INFO):
         buffers = tungsten.render(path, seed=5, threads=1)
     assert [name for name, _ in buffers.quantities()] == ["color"]
-    assert not buffers.color.has_halves
+    assert buffers.color.halves is None
     assert "bidirectional_path_tracer writes no feature buffers" in caplog.text
     picture = read_image(_stock(path, tmp_path / "stock", "1") / "picture.pfm")
     assert buffers.color.mean.mean() == pytest.approx(picture.mean(), rel=1e-4)
@@ -263,7 +263,7 @@ def test_driving_leaves_the_scene_and_its_own_outputs_as_they_are(write_scene, t
     assert rendered.tonemap == "filmic"
     for name in ("own.pfm", "picture.pfm"):
         np.testing.assert_allclose(read_image(ours / name), read_image(stock / name), rtol=1e-5, atol=1e-6)
-    assert rendered.buffers.albedo.has_halves
+    assert rendered.buffers.albedo.halves is not None
 
 
 @in_process

@@ -23,11 +23,11 @@ def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
 
     Raises InputError if the colour lacks its halves or variance, or the command fails.
     """
-    if not buffers.color.has_halves or buffers.color.variance is None:
+    if buffers.color.halves is None or buffers.color.variance is None:
         raise InputError("NFOR: expected a colour with halves A and B and its variance; save them as well")
     kept = {name: getattr(buffers, name) for name in FEATURES}
     kept = {
-        name: buffer if buffer and buffer.has_halves and buffer.variance is not None else None
+        name: buffer if buffer and buffer.halves and buffer.variance is not None else None
         for name, buffer in kept.items()
     }
     buffers = replace(buffers, **kept, visibility=None, alpha=None, spp=None)

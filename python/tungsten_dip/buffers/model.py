@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 FloatImage = npt.NDArray[np.float32]
 
+Halves = tuple[FloatImage, FloatImage]
+"""An image made of half A of the samples alone, and one of the same shape made of half B alone."""
+
+FloatArray = npt.NDArray[np.float32]
+"""Of any shape that is not an image's."""
+
 CHANNELS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
 """Channel count of every quantity a renderer may write."""
 
@@ -42,9 +48,14 @@ class Buffer:
     variance: FloatImage | None = None
 
     @property
-    def has_halves(self) -> bool:
-        """Whether both halves are known."""
-        return self.half_a is not None and self.half_b is not None
+    def halves(self) -> Halves | None:
+        """Both halves, None unless both are known."""
+        return None if self.half_a is None or self.half_b is None else (self.half_a, self.half_b)
+
+    @property
+    def halves_or_mean(self) -> Halves:
+        """Both halves, or the mean in place of either."""
+        return self.halves or (self.mean, self.mean)
 
     def planes(self) -> Iterator[tuple[str, FloatImage]]:
         """Yield (name, array) for every array that is known, in the order of the fields."""

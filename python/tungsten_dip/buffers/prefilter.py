@@ -26,8 +26,8 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
         feature: Buffer | None = getattr(buffers, name)
-        if feature is not None and feature.half_a is not None and feature.half_b is not None:
-            mean, half_a, half_b, variance = feature.mean, feature.half_a, feature.half_b, feature.variance
+        if feature is not None and feature.halves is not None:
+            mean, (half_a, half_b), variance = feature.mean, feature.halves, feature.variance
             for radius, k in _PASSES:
                 mean, half_a, half_b, variance = _core.prefilter_feature(
                     mean, half_a, half_b, variance, radius=radius, k=k, threads=thread_count(threads)

@@ -19,6 +19,6 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     halves, and where nothing in the image tells, ``independent`` is False. Expects sanitised buffers.
     """
     color = buffers.color
-    if color.half_a is None or color.half_b is None:
+    if color.halves is None:
         return HalvesTest()
-    return _core.compare_halves(color.half_a, color.half_b, color.variance, thread_count(threads))
+    return _core.compare_halves(*color.halves, color.variance, thread_count(threads))

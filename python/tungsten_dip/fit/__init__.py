@@ -9,10 +9,10 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import checked_candidates, checked_previous
+from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
@@ -34,9 +34,9 @@ def denoise(
     settings: FitSettings | None = None,
     progress: Progress = silent,
     *,
-    candidates: Sequence[tuple[FloatImage, FloatImage]] = (),
+    candidates: Sequence[Halves] = (),
     warm_start: Model | None = None,
-    previous: tuple[FloatImage, FloatImage] | None = None,
+    previous: Halves | None = None,
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, Halves
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
 """Relative difference of the halves' results from their mean at which all samples are half believed."""
 
 
-def with_all_samples(fused: tuple[FloatImage, FloatImage], whole: FloatImage, threads: int) -> FloatImage:
+def with_all_samples(fused: Halves, whole: FloatImage, threads: int) -> FloatImage:
     """Return the mean of both halves' results, moved towards what the same weights make of all samples.
 
     All have shape (height, width, 3). ``whole`` is followed no further than the halves' results differ in the

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.buffers.statistics import halves_independent
+from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.fireflies import limit_fireflies
@@ -30,33 +29,16 @@ from tungsten_dip.fit.pilots import (
     following_guides,
     guidance_of_halves,
 )
-from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.settings import RELMSE_EPSILON, FitSettings
 from tungsten_dip.progress import Progress
 
-Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
-
-Halves = tuple[FloatImage, FloatImage]
-"""An image made of half A of the samples alone, and one made of half B alone; shape (height, width, 3)."""
 
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
 
 _BRIGHTEST = 1e15
 """Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
-
-_ONLY_PILOT = Pilot(9, k=1.0)
-"""Used alone where nothing can score the pilots."""
-
-_UNEQUAL = 0.5
-"""Halves of one and two samples are so far apart from the mean of all three, in units of half their
-difference, with room to spare."""
-
-_ROUNDED = 2e-3
-"""Relative difference that rounding to 16 bits explains."""
-
-_CONVERGED = 1e-5
-"""relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
 SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
@@ -156,44 +138,6 @@ class Evidence:
         )
 
 
-def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> tuple[Halves, ...]:
-    """Return the candidates as float32.
-
-    Raises InputError if one is not a pair of images of the colour's shape, or holds NaN or Inf.
-    """
-    checked = []
-    for index, pair in enumerate(candidates):
-        checked.append(_checked_pair(f"candidate {index}", pair, buffers))
-        for name, image in zip("AB", checked[-1], strict=True):
-            if not np.isfinite(image).all():
-                raise InputError(
-                    f"candidate {index}, half {name}: expected finite radiance, found NaN or Inf"
-                )
-    return tuple(checked)
-
-
-def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves | None:
-    """Return the previous frame's halves as float32, NaN where they show nothing.
-
-    Raises InputError if they are not a pair of images of the colour's shape.
-    """
-    return None if previous is None else _checked_pair("previous", previous, buffers)
-
-
-def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
-    if len(pair) != 2:
-        raise InputError(f"{what}: expected a pair of images, one per half, got {len(pair)}")
-    expected = buffers.color.mean.shape
-    with np.errstate(over="ignore"):
-        images = [np.ascontiguousarray(image, np.float32) for image in pair]
-    for name, image in zip("AB", images, strict=True):
-        if image.shape != expected:
-            raise InputError(
-                f"{what}, half {name}: expected shape {expected} as the colour has it, got {image.shape}"
-            )
-    return images[0], images[1]
-
-
 def evidence_from_buffers(
     buffers: RenderBuffers,
     settings: FitSettings,
@@ -202,54 +146,29 @@ def evidence_from_buffers(
     started: float,
     progress: Progress,
     previous: Halves | None = None,
-) -> Evidence | FitResult:
+) -> Evidence:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
+    The buffers have halves, and their noise is independent (`without_halves`).
     ``pilots`` as a layout, of a network that exists, says all that it expects; all its pilots are computed.
     ``candidates`` are further pilots that somebody else computed, of linear radiance. ``previous`` is one
     more, NaN where it shows nothing, that guides the others as well. ``started`` is a value of
     time.perf_counter.
 
-    Where there are no independent halves to score pilots with, returns what one of them makes of the image.
-
     Raises InputError if a layout names a feature that is missing or another number of candidates.
     """
-    notes = []
-    scale = _exposure(buffers.color.mean)
-    missing = [name for name in ("albedo", "normal", "depth") if getattr(buffers, name) is None]
-    if missing:
-        notes.append(f"no {', '.join(missing)}: edges are found with less evidence")
+    notes = notes_on_features(buffers)
+    scale = exposure(buffers.color.mean)
     color = buffers.color
-    variance = None if color.variance is None else _scaled(_scaled(color.variance, scale), scale)
+    assert color.halves is not None
+    half_a, half_b = color.halves
+    variance = scaled_variance(color, scale)
     threads = thread_count(settings.threads)
     layout = pilots if isinstance(pilots, Layout) else None
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
 
-    test = halves_independent(buffers, settings.threads)
-    if color.half_a is None or color.half_b is None or not test.independent or not _halves_belong(color):
-        if _converged(color, scale):
-            notes.append("the halves agree to within a few thousandths: the image is returned as it is")
-            image = color.mean.copy()
-        else:
-            notes.append(_why_no_halves(buffers, test, settings.pilot))
-            if candidates or previous is not None:
-                notes.append("the candidates are not used: nothing can score them")
-            if settings.pilot == "oidn":
-                image = _oidn_mean(buffers, color.mean, settings.threads)
-            else:
-                colors = (_scaled(color.mean, scale),)
-                guidance = guidance_of_halves(buffers, colors, scale, threads)
-                progress(0.2, "features")
-                guides = first_guides(colors, variance, guidance)
-                (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
-                image = unscaled(image, scale)
-        seconds = time.perf_counter() - started
-        progress(1.0, "one pilot")
-        history = (HistoryPoint(seconds, 0, None),)
-        return FitResult(image, settings, seconds, iterations=0, history=history, notes=tuple(notes))
-
-    mean = _scaled(color.mean, scale)
-    halves, fireflies = limit_fireflies(_scaled(color.half_a, scale), _scaled(color.half_b, scale), threads)
+    mean = scaled(color.mean, scale)
+    halves, fireflies = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
     if fireflies is not None:
         notes.append(fireflies)
         mean = np.float32(0.5) * (halves[0] + halves[1])
@@ -265,7 +184,7 @@ def evidence_from_buffers(
     if previous is None:
         guides = first_guides(halves, variance, guidance)
     else:
-        moved = _scaled(previous[0], scale), _scaled(previous[1], scale)
+        moved = scaled(previous[0], scale), scaled(previous[1], scale)
         guides, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
     maker = PilotMaker(halves, variance, guidance, guides)
@@ -282,7 +201,7 @@ def evidence_from_buffers(
         images.append(computed[pilot])
     described = described[: len(images) - 1]
     for image_a, image_b in candidates:
-        images.append((np.maximum(_scaled(image_a, scale), 0), np.maximum(_scaled(image_b, scale), 0)))
+        images.append((np.maximum(scaled(image_a, scale), 0), np.maximum(scaled(image_b, scale), 0)))
     if previous is not None:
         images.append(filled)
 
@@ -328,8 +247,8 @@ def pilots_of_all_samples(
         computed.append(maker.images(pilot)[0] * something)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
-        handed_in[-1] = _scaled(image, evidence.scale)
+        image = oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
+        handed_in[-1] = scaled(image, evidence.scale)
     return (evidence.mean, *computed, *handed_in)
 
 
@@ -376,8 +295,8 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
 
 
-def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
-    """What Open Image Denoise makes of all samples, never negative."""
+def oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
+    """Return what Open Image Denoise makes of all samples, never negative."""
     albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
     return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
 
@@ -386,11 +305,7 @@ def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: 
     """What Open Image Denoise makes of each half, from the features of that half alone."""
 
     def of_half(feature: Buffer | None, half: int) -> FloatImage | None:
-        if feature is None:
-            return None
-        if feature.half_a is None or feature.half_b is None:
-            return feature.mean
-        return (feature.half_a, feature.half_b)[half]
+        return None if feature is None else feature.halves_or_mean[half]
 
     a, b = (
         oidn_image(
@@ -419,10 +334,22 @@ def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
     return something
 
 
-def _scaled(image: FloatImage, scale: float) -> FloatImage:
+def notes_on_features(buffers: RenderBuffers) -> list[str]:
+    """Return what there is to say of features that are missing."""
+    missing = [name for name in FEATURES if getattr(buffers, name) is None]
+    return [f"no {', '.join(missing)}: edges are found with less evidence"] if missing else []
+
+
+def scaled(image: FloatImage, scale: float) -> FloatImage:
+    """Return radiance in the units of the evidence, bounded so that squares do not overflow."""
     brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
-    scaled: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
-    return scaled
+    bounded: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
+    return bounded
+
+
+def scaled_variance(color: Buffer, scale: float) -> FloatImage | None:
+    """Return the variance of the colour in the units of the evidence, None if it is not known."""
+    return None if color.variance is None else scaled(scaled(color.variance, scale), scale)
 
 
 def unscaled(image: FloatImage, scale: float) -> FloatImage:
@@ -457,42 +384,10 @@ def _capped(error: FloatImage, threads: int) -> FloatImage:
     return capped
 
 
-def _converged(color: Buffer, scale: float) -> bool:
-    """Whether halves differ (copies do not) by less than lets a test tell if their noise is independent."""
-    if color.half_a is None or color.half_b is None:
-        return False
-    squared = color.mean.astype(np.float64) ** 2 + RELMSE_EPSILON / scale**2
-    noise = float(np.mean((color.half_a - color.half_b).astype(np.float64) ** 2 / 4 / squared))
-    sampled = 0.0 if color.variance is None else float(np.mean(color.variance / squared))
-    return 0 < noise < _CONVERGED and sampled < _CONVERGED
-
-
-def _exposure(color: FloatImage) -> float:
-    """The power of two that brings the median of the lit pixels near the typical radiance (exact to undo)."""
+def exposure(color: FloatImage) -> float:
+    """Return the power of two that brings the median of the lit pixels near the typical radiance."""
     level = color.mean(axis=2, dtype=np.float64)
     lit = level[level > 0]
     if lit.size == 0:
         return 1.0
     return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
-
-
-def _halves_belong(color: Buffer) -> bool:
-    """Whether the colour is the mean of its halves, but for rounding and for halves of unequal size."""
-    assert color.half_a is not None
-    assert color.half_b is not None
-    a, b = color.half_a.astype(np.float64), color.half_b.astype(np.float64)
-    apart = np.median(abs((a + b) / 2 - color.mean))
-    noise, level = np.median(abs(a - b) / 2), np.median(abs(color.mean))
-    return bool(apart <= _UNEQUAL * noise + _ROUNDED * level)
-
-
-def _why_no_halves(buffers: RenderBuffers, test: _core.HalvesTest, pilot: str) -> str:
-    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "one pilot is used"
-    tail = f"nothing can score the result: {used}, without an estimate of its error"
-    if not buffers.color.has_halves:
-        return f"no half buffers: {tail}"
-    if test.independent:
-        return f"the half buffers are those of another picture than the colour: {tail}"
-    if not np.isfinite(test.correlation):
-        return f"the image is too small or too plain to tell whether its halves are independent: {tail}"
-    return f"the half buffers are not independent (correlation {test.correlation:.2f}): {tail}"

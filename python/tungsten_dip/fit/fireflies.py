@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8
@@ -24,9 +24,7 @@ _BRIGHTEST = 1e30
 """Sums of brighter pixels overflow."""
 
 
-def limit_fireflies(
-    half_a: FloatImage, half_b: FloatImage, threads: int
-) -> tuple[tuple[FloatImage, FloatImage], str | None]:
+def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tuple[Halves, str | None]:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
     What both halves show about alike is left alone, whatever its radiance, and so is everything up to 15

@@ -10,9 +10,9 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
 from tungsten_dip.fit.all_samples import with_all_samples
-from tungsten_dip.fit.evidence import Array, Evidence, Halves, unscaled
+from tungsten_dip.fit.evidence import Evidence, unscaled
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.fit.yielding import with_what_was_lost
 
@@ -31,7 +31,9 @@ _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
-def estimate_error(pilots: Sequence[Halves], scale: float, fused_a: Array, fused_b: Array) -> Array:
+def estimate_error(
+    pilots: Sequence[Halves], scale: float, fused_a: FloatArray, fused_b: FloatArray
+) -> FloatArray:
     """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
 
     ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs made of one half each,
@@ -67,13 +69,13 @@ def _epsilon_of_renderer(scale: float) -> np.float32:
     return np.float32(min(max(RELMSE_EPSILON * scale**2, 1e-30), 1e30))
 
 
-def _relative(squared: Array, denominator: Array) -> Array:
+def _relative(squared: FloatArray, denominator: FloatArray) -> FloatArray:
     with np.errstate(over="ignore"):
-        relative: Array = np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
+        relative: FloatArray = np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
     return relative
 
 
-def held_out_error(pilots: Sequence[Halves], fused_a: Array, fused_b: Array) -> float:
+def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: FloatArray) -> float:
     """Return the mean of the same error as the other half tells it: without bias, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
@@ -90,7 +92,7 @@ def held_out_error(pilots: Sequence[Halves], fused_a: Array, fused_b: Array) -> 
 
 
 def _told_by_halves(
-    witnesses: Halves, fused_a: Array, fused_b: Array, epsilon: np.float32
+    witnesses: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
 ) -> tuple[float, float]:
     """Return the mean error that independent witnesses tell, and its standard error.
 
@@ -130,7 +132,7 @@ def result_from_fused(
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
-    squared: Array = np.float32(0.25) * (half_a - half_b) ** 2
+    squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
     told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))

@@ -15,7 +15,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 
 # Features are scaled so that one unit is a difference which separates two surfaces; these penalties of
@@ -42,7 +42,6 @@ _GUIDE_OFFSET = 0.05
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
-_Pair = tuple[FloatImage, FloatImage]
 
 _ACROSS_EDGES = 0.3
 """Standard deviation, in pixels, of the mean along edges in the direction across them."""
@@ -174,7 +173,7 @@ def guidance_of_halves(
             np.minimum(albedo, 1 + np.maximum(color, 0))
             for albedo, color in zip(_planes(given, len(colors)), shown, strict=True)
         )
-        if given.has_halves and len(colors) == 2:
+        if given.halves is not None and len(colors) == 2:
             a, b = albedos
             bounded = Buffer(np.float32(0.5) * (a + b), a, b, given.variance)
         else:
@@ -202,8 +201,7 @@ def guidance_of_halves(
         emission = smooth_emission = np.zeros(shown[half].shape, np.float32)
         if filtered.albedo is not None:
             smooth = _planes(filtered.albedo, len(colors))[half]
-            black = channel_mean(smooth) < _BLACK_ALBEDO
-            albedo = np.where(black, np.float32(1), np.clip(smooth, 0, 1) + np.float32(_LEAST_ALBEDO))
+            albedo = divisor(np.clip(smooth, 0, 1))
             emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
             smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
             if emission.any():
@@ -234,9 +232,9 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     A path that chanced upon a light through glass or a mirror is noise, and left to the colour: as emission
     it would stay where it is, and be believed.
     """
-    a, b = albedo.half_a, albedo.half_b
-    if a is None or b is None or not (albedo.mean > 1).any():
+    if albedo.halves is None or not (albedo.mean > 1).any():
         return albedo
+    a, b = albedo.halves
     limits = (
         1 + np.float32(_STRAY * (2 * _STRAY_RADIUS + 1) ** 2) * np.maximum(around, 0)
         for around in (_core.box_mean(np.maximum(half - 1, 0), _STRAY_RADIUS, threads) for half in (b, a))
@@ -273,9 +271,13 @@ def _feature_planes(
 
 def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
     """Both halves of a feature, or its mean ``count`` times."""
-    if count == 2 and feature.half_a is not None and feature.half_b is not None:
-        return feature.half_a, feature.half_b
-    return (feature.mean,) * count
+    return feature.halves_or_mean if count == 2 else (feature.mean,)
+
+
+def divisor(albedo: FloatImage) -> FloatImage:
+    """Return what divides the colour of surfaces of this albedo, so that light is left."""
+    black = channel_mean(albedo) < _BLACK_ALBEDO
+    return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
 
 
 def first_guides(
@@ -301,8 +303,8 @@ def first_guides(
 
 
 def following_guides(
-    colors: _Pair, previous: _Pair, guidance: tuple[Guidance, ...]
-) -> tuple[Guides, _Pair, _Pair]:
+    colors: Halves, previous: Halves, guidance: tuple[Guidance, ...]
+) -> tuple[Guides, Halves, Halves]:
     """Return guides as `first_guides`, at a part of its cost.
 
     ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the

@@ -16,13 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
 from tungsten_dip.fit.evidence import (
     OUTLIER,
     SCORE_RADII,
-    Array,
     Evidence,
-    Halves,
     denominators_of,
     squared_error,
 )
@@ -85,7 +83,7 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
             yield np.clip(score, -3, 3)[:, :, 0]
 
 
-def network_inputs(evidence: Evidence) -> Array:
+def network_inputs(evidence: Evidence) -> FloatArray:
     """Return the planes of both halves, shape (2, height * width, planes)."""
     height, width = evidence.halves[0].shape[:2]
     # Filled plane by plane: this is the largest array of a fit.
@@ -104,9 +102,9 @@ class Standardisation:
     """What brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
 
     mean: npt.NDArray[np.float64]
-    std: Array
+    std: FloatArray
 
-    def apply(self, inputs: Array, threads: int) -> None:
+    def apply(self, inputs: FloatArray, threads: int) -> None:
         """Standardise planes in place, shape (2, pixels, planes), clipped to 4 standard deviations."""
 
         def apply(half: int) -> None:
@@ -122,7 +120,7 @@ class Standardisation:
         of_both_halves(apply, threads)
 
 
-def standardisation_of(inputs: Array, threads: int) -> Standardisation:
+def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
     """Return mean and standard deviation of every plane of shape (2, pixels, planes)."""
     count = inputs.shape[0] * inputs.shape[1]
 
@@ -137,7 +135,7 @@ def standardisation_of(inputs: Array, threads: int) -> Standardisation:
     return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
 
 
-def _parts(planes: Array) -> Iterator[Array]:
+def _parts(planes: FloatArray) -> Iterator[FloatArray]:
     """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
     for first in range(0, len(planes), _PART_PIXELS):
         yield planes[first : first + _PART_PIXELS]

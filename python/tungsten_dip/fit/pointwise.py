@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import onnx
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import Array, Indices
+from tungsten_dip.fit.evidence import Indices
 from tungsten_dip.fit.model import Weights
 from tungsten_dip.graphs.builder import GraphBuilder
 from tungsten_dip.graphs.sessions import Device, session_from_proto
@@ -38,10 +38,10 @@ class Examples:
     colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
-    inputs: Array
-    choices: Array
-    wanted: Array
-    weight: Array
+    inputs: FloatArray
+    choices: FloatArray
+    wanted: FloatArray
+    weight: FloatArray
 
     def at(self, pixels: Indices) -> Examples:
         """Return a copy of some of them."""
@@ -56,7 +56,7 @@ class Examples:
         pixels = len(self.inputs) // 2
         return self.part(half * pixels, (half + 1) * pixels)
 
-    def _arrays(self) -> tuple[Array, ...]:
+    def _arrays(self) -> tuple[FloatArray, ...]:
         return self.inputs, self.choices, self.wanted, self.weight
 
 
@@ -125,7 +125,7 @@ class PointwiseNetwork:
             },
         )
 
-    def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> Array:
+    def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> FloatArray:
         """Return the weighted mean of the pilots or, by the same weights, of ``images``; shape (pixels, 3).
 
         Raises InputError if it is not finite.
@@ -159,7 +159,7 @@ class PointwiseNetwork:
         """Replace the weights."""
         self._weights = self._vector(weights)
 
-    def _vector(self, weights: Weights) -> Array:
+    def _vector(self, weights: Weights) -> FloatArray:
         return np.concatenate([weights[name].ravel() for name in self._shapes])
 
 

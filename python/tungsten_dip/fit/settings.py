@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Literal, get_args, get_origin, get_type_hints
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.errors import InputError
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class FitResult:
     iterations: int
     error: FloatImage | None = None
     estimated_relmse: float | None = None
-    halves: tuple[FloatImage, FloatImage] | None = None
+    halves: Halves | None = None
     model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()
     interrupted: bool = False

@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tungsten_dip.fit.evidence import Array, Evidence, Indices, Layout, with_best_reference
+from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.fit.evidence import Evidence, Indices, Layout, with_best_reference
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.outcome import estimate_error, held_out_error
@@ -91,7 +92,7 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None = None)
 
 def _start(
     evidence: Evidence,
-    inputs: Array,
+    inputs: FloatArray,
     standardisation: Standardisation,
     weights: Weights,
     warm: bool,

@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _Floats = npt.NDArray[np.float64]
-_Pair = tuple[FloatImage, FloatImage]
 
 _OCTAVES = np.arange(0, 4.5, 0.5)
 """Pixels so many factors of two darker (or brighter) than the result, or more, are judged together."""
@@ -30,7 +29,7 @@ _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""
 
 
-def with_what_was_lost(halves: _Pair, fused: _Pair) -> _Pair:
+def with_what_was_lost(halves: Halves, fused: Halves) -> Halves:
     """Give back to each half's image what its noisy half rightly shows otherwise.
 
     ``halves`` are the noisy halves and ``fused`` what was made of each alone, both in the units of

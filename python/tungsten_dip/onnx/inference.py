@@ -9,26 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.evidence import (
-    Array,
-    Evidence,
-    Halves,
-    checked_candidates,
-    checked_previous,
-    evidence_from_buffers,
-    pilots_of_all_samples,
-)
+from tungsten_dip.fit.candidates import checked_candidates, checked_previous
+from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
 from tungsten_dip.fit.outcome import result_from_fused
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.without_halves import result_without_halves
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
@@ -103,9 +97,11 @@ def _infer_fusion(
 ) -> FitResult:
     started = time.perf_counter()
     assert model.layout is not None
+    offered = bool(candidates) or previous is not None
+    alone = result_without_halves(buffers, settings, started, progress, offered=offered)
+    if alone is not None:
+        return alone
     evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress, previous)
-    if isinstance(evidence, FitResult):
-        return evidence
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
         whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
@@ -167,7 +163,7 @@ def _infer_paper(
     return FitResult(color, settings, seconds, iterations=0, model=model, notes=images.notes)
 
 
-def _finite(output: Array) -> Array:
+def _finite(output: FloatArray) -> FloatArray:
     if not np.isfinite(output).all():
         raise InputError("the model gives no finite image: its weights are too large; fit a new one")
     return output

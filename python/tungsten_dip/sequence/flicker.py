@@ -12,10 +12,8 @@ import math
 import numpy as np
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.settings import RELMSE_EPSILON
-
-Halves = tuple[FloatImage, FloatImage]
 
 _SURE = 0.35
 """Relative standard error up to which the unbiased estimate is believed."""

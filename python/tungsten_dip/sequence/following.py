@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from tungsten_dip import fit
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
@@ -25,7 +25,7 @@ from tungsten_dip.onnx import inference
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker
-from tungsten_dip.sequence.reprojection import Halves, check_camera, reproject
+from tungsten_dip.sequence.reprojection import check_camera, reproject
 
 _LOG = logging.getLogger(__name__)
 
@@ -188,8 +188,6 @@ def _flicker(last: _Last, buffers: RenderBuffers, result: FitResult) -> float | 
     color, before = buffers.color, last.buffers.color
     if result.halves is None or last.result.halves is None:
         return None
-    if color.half_a is None or color.half_b is None or before.half_a is None or before.half_b is None:
+    if color.halves is None or before.halves is None:
         return None
-    return estimated_flicker(
-        result.halves, last.result.halves, (color.half_a, color.half_b), (before.half_a, before.half_b)
-    )
+    return estimated_flicker(result.halves, last.result.halves, color.halves, before.halves)

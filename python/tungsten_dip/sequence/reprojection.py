@@ -14,9 +14,9 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.pilots import divisor
 from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
 
 _DEPTH_TOLERANCE = 0.02
@@ -28,13 +28,6 @@ _ALBEDO_TOLERANCE = 0.1
 
 _LEAST_WEIGHT = 0.25
 """Of the four pixels around a point, in total; less is the rim of a surface."""
-
-_LEAST_ALBEDO = 0.01
-_BLACK_ALBEDO = 1e-3
-"""A colour that cannot come from the albedo is not divided by it; as the fit has it (`fit/pilots.py`)."""
-
-Array = npt.NDArray[np.float32]
-Halves = tuple[FloatImage, FloatImage]
 
 
 def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
@@ -88,7 +81,7 @@ def reproject(
     return moved_a, moved_b
 
 
-def _points(camera: Camera, depth: Array) -> tuple[Array, Array]:
+def _points(camera: Camera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the camera's position, and the way from there to what every pixel shows (length 1 for sky)."""
     height, width = depth.shape
     frame = np.asarray(camera.world_from_local, np.float64)
@@ -102,7 +95,9 @@ def _points(camera: Camera, depth: Array) -> tuple[Array, Array]:
     return frame[:3, 3].astype(np.float32), world * np.where(depth > 0, depth, 1)[:, :, None]
 
 
-def _seen_from(camera: Camera, points: tuple[Array, Array], hit: npt.NDArray[np.bool_]) -> tuple[Array, ...]:
+def _seen_from(
+    camera: Camera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_]
+) -> tuple[FloatArray, ...]:
     """Return where a camera sees points, in pixels (far outside if behind it), and how far from it they are.
 
     Arrays are flat. The distance of the sky is 0.
@@ -121,8 +116,8 @@ def _seen_from(camera: Camera, points: tuple[Array, Array], hit: npt.NDArray[np.
 
 
 def _neighbours(
-    column: Array, row: Array, height: int, width: int
-) -> Iterator[tuple[npt.NDArray[np.intp], Array]]:
+    column: FloatArray, row: FloatArray, height: int, width: int
+) -> Iterator[tuple[npt.NDArray[np.intp], FloatArray]]:
     """Yield flat indices and bilinear weights of the four pixels around; the weight is 0 outside."""
     left, top = np.floor(column), np.floor(row)
     right_share, bottom_share = column - left, row - top
@@ -137,7 +132,7 @@ def _neighbours(
 
 
 def _same_surface(
-    previous: RenderBuffers, index: npt.NDArray[np.intp], current: RenderBuffers, distance: Array
+    previous: RenderBuffers, index: npt.NDArray[np.intp], current: RenderBuffers, distance: FloatArray
 ) -> npt.NDArray[np.bool_]:
     assert previous.depth is not None
     found = previous.depth.mean.ravel()[index]
@@ -154,9 +149,9 @@ def _same_surface(
     return same
 
 
-def _largest(values: Array) -> Array:
+def _largest(values: FloatArray) -> FloatArray:
     """Return the largest of three values, faster than numpy's along a short axis."""
-    largest: Array = np.maximum(np.maximum(values[:, 0], values[:, 1]), values[:, 2])
+    largest: FloatArray = np.maximum(np.maximum(values[:, 0], values[:, 1]), values[:, 2])
     return largest
 
 
@@ -165,12 +160,7 @@ def _divisors(buffers: RenderBuffers) -> tuple[FloatImage | np.float32, ...]:
     albedo = buffers.albedo
     if albedo is None:
         return np.float32(1), np.float32(1)
-    a = albedo.mean if albedo.half_a is None else albedo.half_a
-    b = albedo.mean if albedo.half_b is None else albedo.half_b
-    return tuple(
-        np.where(channel_mean(image) < _BLACK_ALBEDO, np.float32(1), image + np.float32(_LEAST_ALBEDO))
-        for image in (a, b)
-    )
+    return tuple(divisor(image) for image in albedo.halves_or_mean)
 
 
 def _rotation(camera: Camera) -> npt.NDArray[np.float64]:

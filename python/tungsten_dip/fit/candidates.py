@@ -1,0 +1,48 @@
+"""Guesses at the clean image that somebody else made, checked before anything relies on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tungsten_dip.buffers.model import Halves, RenderBuffers
+from tungsten_dip.errors import InputError
+
+
+def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> tuple[Halves, ...]:
+    """Return the candidates as float32.
+
+    Raises InputError if one is not a pair of images of the colour's shape, or holds NaN or Inf.
+    """
+    checked = []
+    for index, pair in enumerate(candidates):
+        checked.append(_checked_pair(f"candidate {index}", pair, buffers))
+        for name, image in zip("AB", checked[-1], strict=True):
+            if not np.isfinite(image).all():
+                raise InputError(
+                    f"candidate {index}, half {name}: expected finite radiance, found NaN or Inf"
+                )
+    return tuple(checked)
+
+
+def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves | None:
+    """Return the previous frame's halves as float32, NaN where they show nothing.
+
+    Raises InputError if they are not a pair of images of the colour's shape.
+    """
+    return None if previous is None else _checked_pair("previous", previous, buffers)
+
+
+def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
+    if len(pair) != 2:
+        raise InputError(f"{what}: expected a pair of images, one per half, got {len(pair)}")
+    expected = buffers.color.mean.shape
+    with np.errstate(over="ignore"):
+        images = [np.ascontiguousarray(image, np.float32) for image in pair]
+    for name, image in zip("AB", images, strict=True):
+        if image.shape != expected:
+            raise InputError(
+                f"{what}, half {name}: expected shape {expected} as the colour has it, got {image.shape}"
+            )
+    return images[0], images[1]
