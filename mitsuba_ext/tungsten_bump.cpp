@@ -5,6 +5,7 @@
 //   slopes     texture of three channels: what the height gains from the texel on the left of a place to the
 //              one on its right, and from the one above to the one below; the third is not used
 //   shape      mesh, cube or quad: which tangents Tungsten bends
+//   consistent bool: whether light must be on the same side of the bent surface and of the flat one
 #include <string>
 
 #include "tungsten_bsdf.hpp"
@@ -25,6 +26,7 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
         const auto shape = props.get<std::string>("shape");
         if (shape != "mesh" && shape != "cube" && shape != "quad")
             Throw("Expected the shape mesh, cube or quad, got \"%s\"", shape);
+        m_consistent = props.get<bool>("consistent", false);
         m_unit = shape != "quad";
         m_mirrors = shape == "mesh";
         for (size_t i = 0; i < m_nested->component_count(); ++i) Base::add_component(m_nested->flags(i));
@@ -35,8 +37,11 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
                                              Mask active) const override {
         const SurfaceInteraction3f bent = bent_interaction(si);
         auto [bs, weight] = m_nested->sample(context, bent, sample1, sample2, active);
-        bs.wo = si.to_local(bent.to_world(bs.wo));
-        return {bs, weight};
+        const Vector3f direction = bent.to_world(bs.wo);
+        const bool is_kept = is_consistent(si, direction, bs.wo);
+        bs.wo = si.to_local(direction);
+        if (!is_kept) bs.pdf = 0.f;
+        return {bs, is_kept ? weight : Spectrum(0.f)};
     }
 
     Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask active) const override {
@@ -48,10 +53,18 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
   protected:
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
         const SurfaceInteraction3f bent = bent_interaction(si);
-        return m_nested->eval_pdf(BSDFContext(), bent, bent.to_local(si.to_world(wo)), true);
+        const Vector3f direction = si.to_world(wo);
+        const Vector3f bent_wo = bent.to_local(direction);
+        if (!is_consistent(si, direction, bent_wo)) return {Spectrum(0.f), 0.f};
+        return m_nested->eval_pdf(BSDFContext(), bent, bent_wo, true);
     }
 
   private:
+    bool is_consistent(const SurfaceInteraction3f& si, const Vector3f& direction,
+                       const Vector3f& bent_wo) const {
+        return !m_consistent || (dr::dot(Vector3f(si.n), direction) < 0.f) == (bent_wo.z() < 0.f);
+    }
+
     SurfaceInteraction3f bent_interaction(const SurfaceInteraction3f& si) const {
         const Vector3f n(si.sh_frame.n);
         Vector3f tangent = si.dp_du;
@@ -82,7 +95,8 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
 
     ref<BSDF> m_nested;
     ref<Texture> m_slopes;
-    bool m_unit;     // tangents have length 1, not that of the quad's edges
+    bool m_unit;  // tangents have length 1, not that of the quad's edges
+    bool m_consistent;
     bool m_mirrors;  // tangents point the other way where the texture is mirrored
 };
 

@@ -66,7 +66,8 @@ class Coat final : public TungstenBsdf<Float, Spectrum> {
         // Tungsten's rough coat has this factor when it samples its substrate and lacks it when it evaluates.
         if (m_roughness) weight *= wi.z() / in.cos_t;
 
-        if (has_flag(bs.sampled_type, BSDFFlags::Delta)) {
+        // A rough coat weighs even a single direction against the density of its own.
+        if (has_flag(bs.sampled_type, BSDFFlags::Delta) && !m_roughness) {
             bs.pdf *= 1.f - probability;
             return {bs, weight / (1.f - probability)};
         }

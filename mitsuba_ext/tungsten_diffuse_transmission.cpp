@@ -1,7 +1,6 @@
-// tungsten_diffuse_transmission: scatters diffusely to both sides.
+// tungsten_diffuse_transmission: scatters diffusely, half to each side.
 //
-//   albedo          texture
-//   transmittance   float in [0, 1]: the share that goes through
+//   albedo   texture
 #include "tungsten_bsdf.hpp"
 
 namespace mitsuba {
@@ -14,7 +13,6 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
 
     explicit DiffuseTransmission(const Properties& props) : Base(props) {
         m_albedo = props.get_texture<Texture>("albedo", 1.f);
-        m_transmittance = props.get<float>("transmittance", 0.5f);
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide | BSDFFlags::BackSide);
         Base::add_component(BSDFFlags::DiffuseTransmission | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
@@ -23,7 +21,7 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         if (!active) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
-        const bool transmit = sample1 < m_transmittance;
+        const bool transmit = sample1 < 0.5f;
         Vector3f wo = warp::square_to_cosine_hemisphere(sample2);
         if (transmit == (si.wi.z() > 0.f)) wo.z() = -wo.z();
         BSDFSample3f bs = transmit ? Base::sample_of(wo, BSDFFlags::DiffuseTransmission, 1)
@@ -38,14 +36,12 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
 
   protected:
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
-        const Float share = si.wi.z() * wo.z() < 0.f ? m_transmittance : 1.f - m_transmittance;
-        const Float density = share * kInvPi * std::abs(wo.z());
+        const Float density = 0.5f * kInvPi * std::abs(wo.z());
         return {m_albedo->eval(si) * density, density};
     }
 
   private:
     ref<Texture> m_albedo;
-    float m_transmittance;
 };
 
 }  // namespace mitsuba

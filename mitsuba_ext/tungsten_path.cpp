@@ -439,7 +439,7 @@ class TungstenPath final : public Variant::Integrator {
         if (path.samples_lights && path.bounce < max_bounces_ - 1) {
             const LightSample light = sample_light(scene, hit, random);
             const auto [value, pdf] = phase->eval_pdf(context, hit, light.direction.d);
-            light_from(scene, hit, light, value, pdf, path.medium, random, path);
+            light_from(scene, hit, light, value, pdf, path.medium, path);
         }
         const float lobe = random.next();
         const auto [direction, weight, pdf] = phase->sample(context, hit, lobe, random.next_2d());
@@ -563,39 +563,23 @@ class TungstenPath final : public Variant::Integrator {
     // throughput.
     static bool scatters(const Medium& medium, Ray3 ray, float surface_t, Random& random, Rgb& throughput,
                          MediumHit& hit) {
-        if (medium.is_homogeneous()) {
-            const auto [sigma_s, sigma_n, sigma_t] = medium.get_scattering_coefficients(hit);
-            if (is_black(sigma_s)) {
-                throughput *= std::isfinite(surface_t) ? Rgb(dr::exp(-surface_t * sigma_t)) : Rgb(0.f);
-                return false;
-            }
-            // The channel that picks the distance is random; the balance heuristic over all three keeps
-            // colour noise low.
-            const auto channel = static_cast<uint32_t>(3.f * random.next());
-            hit = medium.sample_interaction(ray, random.next(), std::min(channel, 2U), true);
-            auto surface = dr::zeros<SurfaceHit>();
-            surface.t = surface_t;
-            const auto [transmittance, pdf] = medium.transmittance_eval_pdf(hit, surface, true);
-            const float mean_pdf = dr::mean(pdf);
-            throughput *= mean_pdf > 0.f ? transmittance / mean_pdf : Rgb(0.f);
-            if (!hit.is_valid() || hit.t >= surface_t) return false;
-            throughput *= hit.sigma_s;
-            return true;
+        const auto [sigma_s, sigma_n, sigma_t] = medium.get_scattering_coefficients(hit);
+        if (is_black(sigma_s)) {
+            throughput *= std::isfinite(surface_t) ? Rgb(dr::exp(-surface_t * sigma_t)) : Rgb(0.f);
+            return false;
         }
-        // Delta tracking (Woodcock et al., 1965).
-        for (float travelled = 0.f;;) {
-            hit = medium.sample_interaction(ray, random.next(), 0, true);
-            if (!hit.is_valid() || travelled + hit.t >= surface_t) return false;
-            travelled += hit.t;
-            const Rgb null_ratio = hit.sigma_n / hit.combined_extinction;
-            const float null_probability = dr::mean(null_ratio);
-            if (random.next() >= null_probability) {
-                throughput *= hit.sigma_s / hit.combined_extinction / (1.f - null_probability);
-                return true;
-            }
-            throughput *= null_ratio / null_probability;
-            ray.o = hit.p;
-        }
+        // The channel that picks the distance is random; the balance heuristic over all three keeps colour
+        // noise low.
+        const auto channel = static_cast<uint32_t>(3.f * random.next());
+        hit = medium.sample_interaction(ray, random.next(), std::min(channel, 2U), true);
+        auto surface = dr::zeros<SurfaceHit>();
+        surface.t = surface_t;
+        const auto [transmittance, pdf] = medium.transmittance_eval_pdf(hit, surface, true);
+        const float mean_pdf = dr::mean(pdf);
+        throughput *= mean_pdf > 0.f ? transmittance / mean_pdf : Rgb(0.f);
+        if (!hit.is_valid() || hit.t >= surface_t) return false;
+        throughput *= hit.sigma_s;
+        return true;
     }
 
     struct LightSample {
@@ -613,12 +597,12 @@ class TungstenPath final : public Variant::Integrator {
     // Returns how much of it arrives, or nothing if it was not asked.
     template <typename Hit>
     std::optional<float> light_from(const Scene& scene, const Hit& from, const LightSample& light,
-                                    const Rgb& value, float pdf, const Medium* medium, Random& random,
-                                    Path& path) const {
+                                    const Rgb& value, float pdf, const Medium* medium, Path& path) const {
         if (!(light.direction.pdf > 0.f) || is_black(value)) return {};
         const Point3& target = light.direction.p;
+        const bool is_endless = has_flag(light.direction.emitter->flags(), EmitterFlags::Infinite);
         const Rgb passed =
-            transmittance(scene, from.spawn_ray_to(target), target, medium, path.bounce + 1, random);
+            transmittance(scene, from.spawn_ray_to(target), target, is_endless, medium, path.bounce + 1);
         const float weight = light.direction.delta ? 1.f : power_heuristic(light.direction.pdf, pdf);
         path.radiance += path.throughput * value * light.weight * passed * weight;
         return dr::mean(passed);
@@ -633,12 +617,13 @@ class TungstenPath final : public Variant::Integrator {
         const auto [value, pdf] = bsdf.eval_pdf(BSDFContext(), hit, local);
         const Medium* medium =
             hit.is_medium_transition() ? hit.target_medium(light.direction.d) : path.medium;
-        return light_from(scene, hit, light, value, pdf, medium, random, path);
+        return light_from(scene, hit, light, value, pdf, medium, path);
     }
 
-    // What of the light reaches `target` along a ray; every transparent surface on the way is a bounce.
-    Rgb transmittance(const Scene& scene, Ray3 ray, const Point3& target, const Medium* medium, int bounce,
-                      Random& random) const {
+    // What of the light reaches `target` along a ray; every transparent surface on the way is a bounce. No
+    // medium lets through what comes from endlessly far.
+    Rgb transmittance(const Scene& scene, Ray3 ray, const Point3& target, bool is_endless,
+                      const Medium* medium, int bounce) const {
         if (!sees_through_ && medium == nullptr)
             return {bounce < min_bounces_ || scene.ray_test(ray) ? 0.f : 1.f};
         for (Rgb result(1.f);;) {
@@ -649,26 +634,16 @@ class TungstenPath final : public Variant::Integrator {
                 !has_flag(preliminary.shape->bsdf()->flags(), BSDFFlags::Null))
                 return {0.f};
             const float distance = is_hit ? preliminary.t : ray.maxt;
-            if (medium != nullptr) result *= transmittance(*medium, ray, distance, random);
+            if (medium != nullptr) {
+                if (!is_hit && is_endless) return {0.f};
+                result *= dr::exp(-distance * medium->get_majorant(dr::zeros<MediumHit>()));
+            }
             if (!is_hit) return bounce >= min_bounces_ ? result : Rgb(0.f);
             const SurfaceHit hit = preliminary.compute_surface_interaction(ray);
             result *= hit.bsdf()->eval_null_transmission(hit);
             if (is_black(result) || ++bounce >= max_bounces_) return {0.f};
             if (hit.is_medium_transition()) medium = hit.target_medium(ray.d);
             ray = hit.spawn_ray_to(target);
-        }
-    }
-
-    static Rgb transmittance(const Medium& medium, Ray3 ray, float distance, Random& random) {
-        if (medium.is_homogeneous()) return dr::exp(-distance * medium.get_majorant(dr::zeros<MediumHit>()));
-        // Ratio tracking (Novak et al., "Residual Ratio Tracking", SIGGRAPH Asia 2014).
-        Rgb result(1.f);
-        for (float travelled = 0.f;;) {
-            const MediumHit hit = medium.sample_interaction(ray, random.next(), 0, true);
-            travelled += hit.t;
-            if (!hit.is_valid() || travelled >= distance) return result;
-            result *= hit.sigma_n / hit.combined_extinction;
-            ray.o = hit.p;
         }
     }
 

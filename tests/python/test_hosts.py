@@ -69,6 +69,16 @@ def test_auto_prefers_tungsten_and_says_who_renders(
     assert asked == ([(scene_path, 2)] if has_tungsten else [])
 
 
+def test_tungsten_reads_the_scene_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text('{"primitives": [{"type": "mesh", "file": "of a fork.abc"}]}')
+    monkeypatch.setattr(tungsten, "available", lambda: True)
+    monkeypatch.setattr(tungsten, "render", lambda path, **_: path)
+    assert hosts.render(path) == path  # type: ignore[comparison-overlap]
+    with pytest.raises(InputError, match="expected a file"):
+        hosts.render(path, host="mitsuba")
+
+
 def test_unknown_host(scene_path: Path) -> None:
     with pytest.raises(InputError, match="host: expected one of auto, tungsten, mitsuba, got blender"):
         hosts.render(scene_path, host="blender")  # type: ignore[arg-type]

@@ -161,8 +161,33 @@ def under(*lights: dict[str, Any]) -> dict[str, Any]:
     return scene
 
 
+def glazed() -> dict[str, Any]:
+    """The room with rough coats over metal and a mirror, and glass that reflects alone."""
+    scene = copy.deepcopy(ROOM)
+    scene["bsdfs"] += [
+        {"name": "gold", "type": "conductor", "material": "Au"},
+        {"name": "coat", "type": "rough_coat", "ior": 1.5, "roughness": 0.1, "substrate": "gold"},
+        {"name": "varnish", "type": "rough_coat", "ior": 1.5, "roughness": 0.05, "substrate": "mirror"},
+        {"name": "hard", "type": "dielectric", "ior": 1.5, "enable_refraction": False},
+        {"name": "frosted", "type": "rough_dielectric", "roughness": 0.2, "enable_refraction": False},
+    ]
+    surfaces = ("coat", "varnish", "hard", "frosted")
+    for primitive, surface in zip(scene["primitives"][1:5], surfaces, strict=True):
+        primitive["bsdf"] = surface
+    return scene
+
+
 CASES = {
     "tent": ROOM,
+    "coats and glass that reflects": glazed(),
+    "bump, consistency checks": {
+        **bumpy(),
+        "integrator": {"type": "path_tracer", "max_bounces": 16, "enable_consistency_checks": True},
+    },
+    "unsampled sun behind a sky": under(
+        {"type": "infinite_sphere_cap", "cap_angle": 20, "emission": 9, "sample": False},
+        {"type": "infinite_sphere", "emission": 0.5},
+    ),
     "bump": bumpy(),
     "sky and suns": outdoors(),
     "sky map": under(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import struct
 from pathlib import Path
@@ -17,6 +18,7 @@ import OpenImageIO  # noqa: E402
 
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402
+from tungsten_dip.hosts.mitsuba.render import render as render_scene  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render_translated  # noqa: E402
 from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant  # noqa: E402
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels  # noqa: E402
@@ -118,7 +120,8 @@ BSDFS: dict[str, Json] = {
     "rough_dielectric": {"type": "rough_dielectric", "roughness": 0.2, "albedo": [0.9, 0.5, 0.9]},
     "rough_dielectric without refraction": {
         "type": "rough_dielectric",
-        "distribution": "phong",
+        "albedo": [0.9, 0.8, 0.7],
+        "distribution": "beckmann",
         "enable_refraction": False,
     },
     "plastic": {"type": "plastic", "albedo": 0.5, "sigma_a": [0.1, 0.2, 0.3]},
@@ -420,9 +423,79 @@ def test_what_tungsten_decodes_to_four_channels_is_opaque(folder: Path, name: st
     assert (seen.max() == 0) == opaque
 
 
-def test_without_lights_the_sky_is_white(folder: Path) -> None:
-    buffers = render(folder, [{**ball(WHITE), "emission": 0.0}], {"fov": 15})
+DARK_LIGHTS: dict[str, Json] = {
+    "skydome": {"type": "skydome", "intensity": 0.0},
+    "cap of no angle": {"type": "infinite_sphere_cap", "power": 3.0, "cap_angle": 0.0},
+    "point": {"type": "point", "emission": 0.0},
+    "curves": {**CURVES, "bsdf": WHITE, "emission": 0.0, "transform": {"position": [0, 9, 0]}},
+    "quad of no size": {"type": "quad", "bsdf": WHITE, "power": 0.0, "transform": {"scale": 0.0}},
+}
+
+
+@pytest.mark.parametrize("light", DARK_LIGHTS.values(), ids=DARK_LIGHTS.keys())
+def test_without_lights_the_sky_is_white(folder: Path, light: Json) -> None:
+    buffers = render(folder, [{**ball(WHITE), "emission": 0.0}, light], {"fov": 15})
     np.testing.assert_allclose(buffers.color.mean.mean(), 1.0, rtol=0.02)
+
+
+def test_a_light_that_is_not_sampled_and_hidden_by_a_later_one_lights_nothing(folder: Path) -> None:
+    sun = {"type": "infinite_sphere_cap", "cap_angle": 40, "emission": 3.0}
+    lit = [
+        render(folder, [FLOOR, {**sun, "sample": sampled}, *sky], spp=64).color.mean[-1].mean()
+        for sampled, sky in ((True, [WHITE_SKY]), (False, [WHITE_SKY]), (True, []), (False, []))
+    ]
+    assert lit[1] == pytest.approx(0.5, rel=0.02)  # of the sky alone
+    assert lit[0] == pytest.approx(0.5 + lit[2], rel=0.05)
+    assert lit[3] == pytest.approx(lit[2], rel=0.05)
+
+
+def test_no_light_comes_through_endless_fog(folder: Path) -> None:
+    fog = {"name": "fog", "type": "homogeneous", "sigma_s": 0.01}
+    for camera, expected in (({"medium": "fog"}, 0.0), ({}, 0.5)):
+        buffers = render(folder, [FLOOR, WHITE_SKY], camera, [fog], spp=64)
+        assert buffers.color.mean[-1].mean() == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", ["dielectric", "rough_dielectric"])
+@pytest.mark.parametrize("turn", [90, -90])
+def test_glass_that_does_not_refract_reflects_on_both_sides(folder: Path, kind: str, turn: float) -> None:
+    glass = {"type": kind, "ior": 1.5, "roughness": 0.01, "enable_refraction": False, "albedo": 0.5}
+    wall = {"type": "quad", "transform": {"rotation": [turn, 0, 0], "scale": 3}, "bsdf": glass}
+    ahead = {"fov": 1, "transform": {"position": [0, 0, 2], "look_at": [0, 0, 0]}}
+    buffers = render(folder, [wall, WHITE_SKY], ahead, spp=64)
+    assert buffers.color.mean.mean() == pytest.approx(0.5 * 0.04, rel=0.01)
+
+
+def test_a_bitmap_of_several_bsdfs_is_loaded_once(folder: Path) -> None:
+    walls = [
+        {"type": "quad", "bsdf": {"type": kind, "albedo": "colour.png"}}
+        for kind in ("lambert", "plastic", "oren_nayar")
+    ]
+    path = folder / "scene.json"
+    path.write_text(json.dumps({"primitives": walls, "camera": {"type": "pinhole", "resolution": [4, 4]}}))
+    with mitsuba_variant():
+        albedos = list(translate(load_scene(path)).albedo.values())
+    assert len(albedos) == 3
+    assert all(albedo is albedos[0] for albedo in albedos)
+
+
+@pytest.mark.parametrize(
+    "primitive",
+    [
+        {**FLOOR, "bsdf": {"type": "rough_dielectric", "ior": 1.0}},
+        {
+            **FLOOR,
+            "ext_medium": {"type": "homogeneous", "phase_function": {"type": "henyey_greenstein", "g": 1}},
+        },
+    ],
+    ids=["ior", "g"],
+)
+def test_what_mitsuba_does_not_take_is_one_line(folder: Path, primitive: Json) -> None:
+    path = folder / "scene.json"
+    camera = {"type": "pinhole", "resolution": [4, 4]}
+    path.write_text(json.dumps({"primitives": [primitive, WHITE_SKY], "camera": camera}))
+    with pytest.raises(InputError, match=r"^Mitsuba cannot load the scene: [^\n]+$"):
+        render_scene(load_scene(path), spp=1, threads=1)
 
 
 def test_hair_without_absorption_makes_and_loses_no_light(folder: Path) -> None:
@@ -590,14 +663,25 @@ def test_two_sided_shading_can_be_switched_off(folder: Path) -> None:
     np.testing.assert_allclose(black, 0.0)
 
 
-def test_a_path_tracer_stands_in_for_what_converges_to_the_same(folder: Path) -> None:
-    bidirectional = {"type": "bidirectional_path_tracer", "max_bounces": 2}
+def test_a_path_tracer_stands_in_for_what_converges_to_the_same(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = folder / "scene.json"
-    path.write_text(json.dumps({"primitives": [FLOOR], "integrator": bidirectional}))
-    with mitsuba_variant():
-        translated = translate(load_scene(path))
-    assert translated.integrator.kind == "path_tracer"
-    assert translated.integrator.max_bounces == 2
+    for kind, more in (
+        ("bidirectional_path_tracer", {}),
+        ("kelemen_mlt", {}),
+        ("photon_map", {"include_surfaces": False, "low_order_scattering": False}),
+    ):
+        caplog.clear()
+        integrator = {"type": kind, "max_bounces": 2, **more}
+        path.write_text(json.dumps({"primitives": [FLOOR], "integrator": integrator}))
+        with mitsuba_variant(), caplog.at_level(logging.INFO):
+            translated = translate(load_scene(path))
+        assert translated.integrator.kind == "path_tracer"
+        assert translated.integrator.max_bounces == 2
+        assert translated.integrator.include_surfaces == (not more)
+        assert translated.integrator.low_order_scattering == (not more)
+        assert f"a path_tracer renders in place of {kind}" in caplog.text
 
 
 def test_shared_objects_are_made_once(folder: Path) -> None:
@@ -741,17 +825,13 @@ REFUSED: dict[str, Json] = {
     "lambertian_fiber": surface({"type": "lambertian_fiber"}),
     "rough_wire": surface({"type": "rough_wire"}),
     "distribution phong": surface({"type": "rough_conductor", "distribution": "phong"}),
-    "coloured rough_dielectric": surface(
-        {"type": "rough_dielectric", "albedo": 0.5, "enable_refraction": False}
-    ),
     "bump mapping of another shape": {"primitives": [{"type": "sphere", "bsdf": BUMPY}]},
-    "bump mapping with enable_consistency_checks": {
-        **surface(BUMPY),
-        "integrator": {"type": "path_tracer", "enable_consistency_checks": True},
-    },
     "texture of type ies": surface({"type": "lambert", "albedo": {"type": "ies", "file": "colour.png"}}),
     "smooth_coat over a BSDF that transmits": surface(
         {"type": "smooth_coat", "substrate": {"type": "dielectric"}}
+    ),
+    "transparency over a BSDF that lets light through": surface(
+        {"type": "transparency", "alpha": 0.5, "base": {"type": "thinsheet"}}
     ),
     "mixed BSDF of a thinsheet": surface({"type": "mixed", "bsdf0": {"type": "thinsheet"}, "bsdf1": GREY}),
     "two smooth layers": surface(
@@ -773,6 +853,7 @@ REFUSED: dict[str, Json] = {
     "skydome of turbidity": {"primitives": [{"type": "skydome", "turbidity": 11}]},
     "curves of mode ribbon": {"primitives": [{**CURVES, "mode": "ribbon"}]},
     "lambert on curves": {"primitives": [{**CURVES, "mode": "bcsdf_cylinder", "bsdf": GREY}]},
+    "curves with a medium": {"primitives": [{**CURVES, "bsdf": GREY, "int_medium": {"type": "homogeneous"}}]},
     "shining curves": {"primitives": [{**CURVES, "emission": 1.0}]},
     "texture on curves": {"primitives": [{**CURVES, "bsdf": {"type": "lambert", "albedo": "colour.png"}}]},
     "file of instances": {"primitives": [{"type": "instances", "masters": [FLOOR], "instances": "many.bin"}]},

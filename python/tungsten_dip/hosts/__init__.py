@@ -39,9 +39,11 @@ def render(
 
     if host == "auto":
         host = "tungsten" if tungsten.available() else "mitsuba"
+    path = scene.path if isinstance(scene, Scene) else scene
+    _log.info("%s: rendered by %s", path, host.capitalize())
+    if host == "tungsten":
+        # Which reads the file itself, and may know more than `load_scene`.
+        return tungsten.render(path, spp=spp, seed=seed, threads=threads, progress=progress)
     if not isinstance(scene, Scene):
         scene = load_scene(scene)
-    _log.info("%s: rendered by %s", scene.path, host.capitalize())
-    if host == "tungsten":
-        return tungsten.render(scene.path, spp=spp, seed=seed, threads=threads, progress=progress)
     return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)

@@ -145,7 +145,7 @@ def decision_of(scene: Scene) -> Decision:
         "color": "the image itself",
         **_reasons_without_information(scene, effects),
     }
-    if not isinstance(scene.integrator, PathTracer):
+    if scene.integrator.kind != PathTracer.kind:
         reasons["integrator"] += f"; in place of {scene.integrator.kind}, which writes no feature buffers"
     features: list[BufferName] = []
     informative: dict[BufferName, str] = {

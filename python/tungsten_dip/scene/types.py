@@ -649,7 +649,7 @@ class Cylinder(Primitive):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Curves(Primitive):
-    """Hairs, quadratic B-splines from a .fiber, .hair or .obj file.
+    """Hairs, quadratic B-splines from a .fiber or .hair file.
 
     ``curve_thickness`` None keeps the widths of the file; ``curve_taper`` thins every curve towards its tip;
     ``subsample`` is the share of curves that is left out.

@@ -9,13 +9,15 @@ import logging
 from collections.abc import Callable
 from typing import Any, Literal
 
-from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, slopes_node, texture_node
+from tungsten_dip.hosts.mitsuba.textures import UV, slopes_node, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant
 from tungsten_dip.scene import types as ts
 
 _LOG = logging.getLogger(__name__)
 
-_WHITE = (1.0, 1.0, 1.0)
+_LETS_THROUGH = ts.TransparencyBsdf | ts.ThinSheetBsdf | ts.ForwardBsdf
+"""What lets light pass straight on, beside what it scatters."""
+
 _SMALLEST_ALPHA = 1e-3  # Tungsten clamps roughness here
 
 # Absorption of the two pigments of hair, per radius.
@@ -53,11 +55,14 @@ def bsdf_object(
     if heights is not None:
         if shape is None:
             raise t.unsupported("bump mapping of another shape than a mesh, a quad or a cube")
-        if t.source.integrator.enable_consistency_checks:
-            raise t.unsupported("bump mapping with enable_consistency_checks")
-        slopes = slopes_node(t, heights, uv)
         # Outside of "twosided": Tungsten turns the bent normal towards the viewer.
-        node = {"type": "tungsten_bump", "nested": node, "slopes": slopes, "shape": shape}
+        node = {
+            "type": "tungsten_bump",
+            "nested": node,
+            "slopes": slopes_node(t, heights, uv),
+            "shape": shape,
+            "consistent": t.source.integrator.enable_consistency_checks,
+        }
     built = t.add_object("bsdf", node)
     t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
     t.place = outer
@@ -82,7 +87,7 @@ def _feature_albedo(bsdf: ts.Bsdf) -> ts.Texture:
 def _transmits(bsdf: ts.Bsdf) -> bool:
     """Whether Tungsten counts it as transmissive, and does not turn it towards the viewer."""
     match bsdf:
-        case ts.RoughDielectricBsdf():
+        case ts.DielectricBsdf() | ts.RoughDielectricBsdf():
             return bsdf.enable_refraction
         case ts.SmoothCoatBsdf() | ts.RoughCoatBsdf():
             return _transmits(bsdf.substrate)
@@ -90,7 +95,7 @@ def _transmits(bsdf: ts.Bsdf) -> bool:
             return _transmits(bsdf.base)
         case ts.MixedBsdf():
             return _transmits(bsdf.bsdf0) or _transmits(bsdf.bsdf1)
-        case ts.DielectricBsdf() | ts.DiffuseTransmissionBsdf() | ts.HairBsdf() | ts.LambertianFiberBsdf():
+        case ts.DiffuseTransmissionBsdf() | ts.HairBsdf() | ts.LambertianFiberBsdf():
             return True
     return False
 
@@ -117,6 +122,8 @@ def _scatters(bsdf: ts.Bsdf) -> bool:
 
 def _node(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
     if isinstance(bsdf, ts.TransparencyBsdf):
+        if isinstance(bsdf.base, _LETS_THROUGH):
+            raise t.unsupported(f"a transparency over a BSDF that lets light through ({bsdf.base.kind})")
         # The mask comes outside: what is behind "twosided" must not transmit.
         opacity = texture_node(t, bsdf.alpha, "alpha_or_average", uv)
         return {"type": "mask", "opacity": opacity, "nested": _node(t, bsdf.base, uv)}
@@ -134,7 +141,7 @@ def _one_sided(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
     return translate(t, bsdf, uv)
 
 
-def _albedo(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+def _albedo(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Any:
     return texture_node(t, bsdf.albedo, "rgb", uv)
 
 
@@ -173,16 +180,25 @@ def _conductor(t: Translation, bsdf: ts.ConductorBsdf | ts.RoughConductorBsdf, u
 
 
 def _dielectric(t: Translation, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
+    if not bsdf.enable_refraction:
+        return _reflecting_glass(t, bsdf, uv)
     return {"type": "dielectric", **_refraction(t, bsdf, uv)}
 
 
 def _rough_dielectric(t: Translation, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
-    if bsdf.enable_refraction:
-        return {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
-    if not is_constant(bsdf.albedo, _WHITE):
-        raise t.unsupported("a coloured rough_dielectric without refraction")
-    # Rough plastic with a black base is the reflection alone.
-    return {"type": "tungsten_plastic", "albedo": constant(0.0), "ior": bsdf.ior, **_rough_layer(t, bsdf, uv)}
+    if not bsdf.enable_refraction:
+        return _reflecting_glass(t, bsdf, uv) | {"type": "roughconductor", **_microfacets(t, bsdf, uv)}
+    return {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
+
+
+def _reflecting_glass(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+    """Glass that reflects alone: a metal that does not absorb."""
+    return {
+        "type": "conductor",
+        "eta": constant(bsdf.ior),
+        "k": constant(0.0),
+        "specular_reflectance": _albedo(t, bsdf, uv),
+    }
 
 
 def _refraction(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
@@ -190,7 +206,7 @@ def _refraction(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf
         "int_ior": bsdf.ior,
         "ext_ior": 1.0,
         "specular_reflectance": _albedo(t, bsdf, uv),
-        "specular_transmittance": _albedo(t, bsdf, uv) if bsdf.enable_refraction else constant(0.0),
+        "specular_transmittance": _albedo(t, bsdf, uv),
     }
 
 
@@ -203,9 +219,7 @@ def _microfacets(t: Translation, bsdf: ts.RoughConductorBsdf | ts.RoughDielectri
     return {"distribution": bsdf.distribution, "alpha": alpha}
 
 
-def _rough_layer(
-    t: Translation, bsdf: ts.RoughPlasticBsdf | ts.RoughCoatBsdf | ts.RoughDielectricBsdf, uv: Matrix
-) -> Node:
+def _rough_layer(t: Translation, bsdf: ts.RoughPlasticBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
     roughness = texture_node(t, bsdf.roughness, "average", uv)
     return {"roughness": roughness, "distribution": bsdf.distribution}
 
@@ -226,9 +240,7 @@ def _plastic(t: Translation, bsdf: ts.PlasticBsdf | ts.RoughPlasticBsdf, uv: Mat
 
 def _coat(t: Translation, bsdf: ts.SmoothCoatBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
     substrate = bsdf.substrate
-    if _transmits(substrate) or isinstance(
-        substrate, ts.TransparencyBsdf | ts.ThinSheetBsdf | ts.ForwardBsdf
-    ):
+    if _transmits(substrate) or isinstance(substrate, _LETS_THROUGH):
         raise t.unsupported(f"a {bsdf.kind} over a BSDF that transmits ({substrate.kind})")
     node = {"type": "tungsten_coat", "nested": _one_sided(t, substrate, uv), **_layer(bsdf)}
     return node | _rough_layer(t, bsdf, uv) if isinstance(bsdf, ts.RoughCoatBsdf) else node
@@ -245,7 +257,7 @@ def _thinsheet(t: Translation, bsdf: ts.ThinSheetBsdf, uv: Matrix) -> Node:
 
 
 def _diffuse_transmission(t: Translation, bsdf: ts.DiffuseTransmissionBsdf, uv: Matrix) -> Node:
-    return {"type": "tungsten_diffuse_transmission", "albedo": _albedo(t, bsdf, uv), "transmittance": 0.5}
+    return {"type": "tungsten_diffuse_transmission", "albedo": _albedo(t, bsdf, uv)}
 
 
 def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:

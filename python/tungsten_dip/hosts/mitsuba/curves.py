@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.bsdfs import bsdf_object
-from tungsten_dip.hosts.mitsuba.textures import is_constant
+from tungsten_dip.hosts.mitsuba.textures import is_constant, shines
 from tungsten_dip.hosts.mitsuba.translation import Translation
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import curve_geometry
@@ -29,8 +29,10 @@ def curve_shapes(t: Translation, primitive: ts.Curves) -> list[Any]:
         raise t.unsupported("curves of mode ribbon")
     if faces_viewer and not isinstance(primitive.bsdf, ts.HairBsdf):
         raise t.unsupported(f"a BSDF of type {primitive.bsdf.kind} on curves of mode bcsdf_cylinder")
-    if primitive.emitter is not None:
+    if shines(t, primitive):
         raise t.unsupported("shining curves")
+    if primitive.int_medium is not None or primitive.ext_medium is not None:
+        raise t.unsupported("curves with a medium")
     textures = [value for value in vars(primitive.bsdf).values() if isinstance(value, ts.Texture)]
     if not all(is_constant(texture) for texture in textures):
         raise t.unsupported("a texture on curves")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
-from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, largest_value
+from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
 
@@ -21,7 +22,7 @@ _ENVMAP_AXES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 def point_node(t: Translation, primitive: ts.Point) -> Node | None:
     """Return Mitsuba's point light, or None where it does not shine."""
     texture = primitive.emitter
-    if texture is None or largest_value(t, texture) <= 0.0:
+    if texture is None or not shines(t, primitive):
         return None
     if not isinstance(texture, ts.ConstantTexture):
         raise t.unsupported(f"a point light with a texture of type {texture.kind}")
@@ -38,11 +39,12 @@ def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
 
     Raises InputError for a texture without counterpart.
     """
+    if not shines(t, primitive):
+        return None
     if isinstance(primitive, ts.Skydome):
         return envmap_node(sky_pixels(t, primitive), np.eye(3))
     texture = primitive.emitter
-    if texture is None or largest_value(t, texture) <= 0.0:
-        return None
+    assert texture is not None
     if isinstance(primitive, ts.InfiniteSphereCap):
         return _cap(t, primitive, texture)
     scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
@@ -73,7 +75,7 @@ def together(environments: Sequence[tuple[Node, bool]]) -> Node:
 
 
 def envmap_node(
-    pixels: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64], *, clamp: bool = False
+    pixels: npt.NDArray[np.floating[Any]], rotation: npt.NDArray[np.float64], *, clamp: bool = False
 ) -> Node:
     """Return an environment map of latitude-longitude texels, row 0 about local +y.
 
@@ -88,9 +90,11 @@ def envmap_node(
     return _envmap(rows, rotation)
 
 
-def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node:
+def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node | None:
     if not isinstance(texture, ts.ConstantTexture):
         raise t.unsupported(f"an infinite_sphere_cap with a texture of type {texture.kind}")
+    if primitive.cap_angle == 0.0:
+        return None
     angle = math.radians(primitive.cap_angle)
     solid_angle = 4.0 * math.pi * math.sin(angle / 2.0) ** 2
     scale = 1.0 / solid_angle if primitive.power is not None else 1.0

@@ -7,6 +7,9 @@ from typing import Any
 from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant
 from tungsten_dip.scene import types as ts
 
+_ENDLESS = 1024
+"""Tungsten's own bound on the bounces of a medium; paths beyond it bring no light that could be seen."""
+
 
 def medium_object(t: Translation, medium: ts.Medium) -> Any:
     """Return the Mitsuba medium.
@@ -28,7 +31,7 @@ def _node(t: Translation, medium: ts.Medium) -> Node:
         raise t.unsupported(f"a medium of type {medium.kind}")
     if not isinstance(medium.transmittance, ts.ExponentialTransmittance):
         raise t.unsupported(f"a transmittance of type {medium.transmittance.kind}")
-    if medium.max_bounces < t.source.integrator.max_bounces:
+    if medium.max_bounces < min(t.source.integrator.max_bounces, _ENDLESS):
         raise t.unsupported(f"a medium with fewer bounces ({medium.max_bounces}) than the integrator")
     sigma_a, sigma_s = ([medium.density * s for s in sigma] for sigma in (medium.sigma_a, medium.sigma_s))
     sigma_t = (sigma_a[0] + sigma_s[0], sigma_a[1] + sigma_s[1], sigma_a[2] + sigma_s[2])

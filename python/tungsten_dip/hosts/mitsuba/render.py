@@ -65,8 +65,12 @@ def render(
     with mitsuba_variant():
         from tungsten_dip.hosts.mitsuba.translate import translate
 
+        try:
+            translated = translate(scene)
+        except RuntimeError as error:
+            raise _cannot_load(error) from None
         return render_translated(
-            translate(scene),
+            translated,
             scene.renderer.spp if spp is None else spp,
             seed,
             threads,
@@ -75,6 +79,10 @@ def render(
             progress,
             quantities,
         )
+
+
+def _cannot_load(error: RuntimeError) -> InputError:
+    return InputError(f"Mitsuba cannot load the scene: {' '.join(str(error).split())}")
 
 
 def render_translated(
@@ -106,7 +114,7 @@ def render_translated(
                 _scene_with_integrator(translated, threads, quantities), parallel=False, optimize=False
             )
         except RuntimeError as error:
-            raise InputError(f"Mitsuba cannot load the scene: {error}") from None
+            raise _cannot_load(error) from None
         done_spp = 0
         statistics: dict[str, _Statistics] = {}
         while done_spp < spp:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from tungsten_dip.hosts.mitsuba.bsdfs import BentShape, bsdf_object, height_map
 from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
-from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, largest_value, texture_node
+from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, shines, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, transform
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import mesh_geometry
@@ -46,7 +46,7 @@ def add_shapes(t: Translation, primitive: ts.Primitive) -> bool:
     """
     for shape in _shapes(t, primitive):
         t.add("shape", shape)
-    return bool(emission_node(t, primitive, 1.0))
+    return shines(t, primitive)
 
 
 def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
@@ -73,7 +73,7 @@ def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
 def emission_node(t: Translation, primitive: ts.Primitive, area: float, uv: Matrix = UV) -> Node:
     """Return {"emitter": ...} for a primitive of this area that shines, else {}."""
     texture = primitive.emitter
-    if texture is None or largest_value(t, texture) <= 0.0:
+    if texture is None or not shines(t, primitive) or area == 0.0:
         return {}
     scale = 1.0 / (math.pi * area) if primitive.power is not None else 1.0
     radiance = texture_node(t, texture, "rgb", uv, scale)

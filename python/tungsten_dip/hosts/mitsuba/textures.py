@@ -23,6 +23,8 @@ from tungsten_dip.scene.types import (
     CheckerTexture,
     ConstantTexture,
     DiskTexture,
+    Primitive,
+    Skydome,
     Texture,
     Vec3,
 )
@@ -35,9 +37,9 @@ Request = Literal["rgb", "average", "alpha_or_average"]
 UV = np.eye(3)
 """A shape whose UV are the same in both renderers; else a 3x3 matrix from Mitsuba's UV to Tungsten's."""
 
-_Texels = npt.NDArray[Any]
+_Texels = npt.NDArray[np.float32]
 
-_GAMMA = np.floor(255.0 * (np.arange(256) / 255.0) ** 2.2 + 1e-9) / 255.0
+_GAMMA = (np.floor(255.0 * (np.arange(256) / 255.0) ** 2.2 + 1e-9) / 255.0).astype(np.float32)
 _HDR_SUFFIXES = {".exr", ".pfm", ".hdr"}
 _ALWAYS_WITH_ALPHA = {".png", ".jpg", ".jpeg"}  # Tungsten decodes these to four channels, whatever they hold
 _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade textures
@@ -45,10 +47,11 @@ _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade texture
 
 def texture_node(
     t: Translation, texture: Texture, request: Request = "rgb", uv: Matrix = UV, scale: float = 1.0
-) -> Node:
-    """Return the Mitsuba texture of a Tungsten texture times ``scale``.
+) -> Any:
+    """Return the Mitsuba texture of a Tungsten texture times ``scale``, as `mitsuba.load_dict` takes it.
 
-    Numbers ("average", "alpha_or_average") have one channel, colours three.
+    A bitmap that is used more than once is the same object. Numbers ("average", "alpha_or_average") have one
+    channel, colours three.
 
     Raises InputError for a type of texture without counterpart and for an image that cannot be read.
     """
@@ -66,11 +69,7 @@ def texture_node(
             "to_uv": transform_uv(squares),
         }
     if isinstance(texture, BitmapTexture):
-        pixels = bitmap_pixels(t, texture, request)
-        effective_scale = scale * texture.scale if texture.interpolate else 1.0
-        return _bitmap_node(
-            pixels * effective_scale, uv, clamp=texture.clamp, nearest=not texture.interpolate
-        )
+        return _bitmap_object(t, texture, request, uv, scale * texture.scale if texture.interpolate else 1.0)
     if isinstance(texture, DiskTexture | BladeTexture):
         mask = coverage(texture, _SHAPE_RESOLUTION)
         value = np.atleast_1d(np.asarray(_requested(texture.value, request, scale)))
@@ -109,6 +108,13 @@ def largest_value(t: Translation, texture: Texture) -> float:
     raise t.unsupported(f"a texture of type {texture.kind}")
 
 
+def shines(t: Translation, primitive: Primitive) -> bool:
+    """Whether a primitive is a light that brings any."""
+    if isinstance(primitive, Skydome):
+        return primitive.intensity > 0.0
+    return primitive.emitter is not None and largest_value(t, primitive.emitter) > 0.0
+
+
 def bitmap_pixels(t: Translation, texture: BitmapTexture, request: Request) -> _Texels:
     """Return the texels as Tungsten holds them, without scale.
 
@@ -119,7 +125,7 @@ def bitmap_pixels(t: Translation, texture: BitmapTexture, request: Request) -> _
     return t.remember(key, _read_texels(texture, request)) if texels is None else texels
 
 
-def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> _Texels:
+def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> npt.NDArray[np.float64]:
     """Return the share of every texel that lies within the disk or the polygon, row 0 at the top."""
     centres = (np.arange(resolution) + 0.5) / resolution * 2.0 - 1.0
     x, y = np.meshgrid(centres, -centres)
@@ -139,7 +145,19 @@ def _requested(value: Vec3, request: Request, scale: float) -> Vec3 | float:
     return value[0] * scale  # Tungsten takes the first component of a constant, not the mean
 
 
-def _bitmap_node(pixels: _Texels, uv: Matrix, *, clamp: bool, nearest: bool) -> Node:
+def _bitmap_object(t: Translation, texture: BitmapTexture, request: Request, uv: Matrix, scale: float) -> Any:
+    settings = (str(texture.file), request, texture.gamma_correct, texture.clamp, texture.interpolate, scale)
+    key = ("texture", *settings, uv.tobytes().hex())
+    found = t.made(key)
+    if found is None:
+        pixels = bitmap_pixels(t, texture, request)
+        scaled = pixels if scale == 1.0 else pixels * np.float32(scale)
+        node = _bitmap_node(scaled, uv, clamp=texture.clamp, nearest=not texture.interpolate)
+        found = t.remember(key, mi.load_dict(node))
+    return found
+
+
+def _bitmap_node(pixels: npt.NDArray[np.floating[Any]], uv: Matrix, *, clamp: bool, nearest: bool) -> Node:
     height, width = pixels.shape[:2]
     # Mitsuba wants two texels each way.
     pixels = np.repeat(np.repeat(pixels, 2 if height < 2 else 1, axis=0), 2 if width < 2 else 1, axis=1)
@@ -173,16 +191,17 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     pixels = np.asarray(pixels)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     channels = pixels.shape[2]
-    alpha = pixels[:, :, -1:] if channels in (2, 4) else None
-    rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
+    alpha: Any = pixels[:, :, -1:] if channels in (2, 4) else None
+    rgb: Any = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
+    texels: Any
     if request == "rgb":
-        if hdr:
-            return rgb.astype(np.float64)
-        return _GAMMA[rgb] if texture.gamma_correct else rgb / 255.0
-    if request == "alpha_or_average" and alpha is not None:
-        return alpha.astype(np.float64) / (1.0 if hdr else 255.0)
-    if request == "alpha_or_average" and texture.file.suffix.lower() in _ALWAYS_WITH_ALPHA:
+        texels = rgb if hdr else _GAMMA[rgb] if texture.gamma_correct else rgb / np.float32(255)
+    elif request == "alpha_or_average" and alpha is not None:
+        texels = alpha / np.float32(1 if hdr else 255)
+    elif request == "alpha_or_average" and texture.file.suffix.lower() in _ALWAYS_WITH_ALPHA:
         _LOG.warning("%s: holds no alpha: as in Tungsten, nothing of it is transparent", texture.file)
-        return np.ones((*pixels.shape[:2], 1))
-    total: _Texels = rgb.astype(np.float64).sum(axis=2, keepdims=True) / 3.0
-    return total if hdr else np.floor(total) / 255.0
+        texels = np.ones((*pixels.shape[:2], 1))
+    else:
+        mean = rgb.sum(axis=2, keepdims=True, dtype=np.float32) / np.float32(3)
+        texels = mean if hdr else np.floor(mean) / np.float32(255)
+    return np.asarray(texels, np.float32)

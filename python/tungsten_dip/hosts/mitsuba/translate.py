@@ -6,6 +6,7 @@ What agrees, what is approximated (and by how much) and what is refused stands i
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 from tungsten_dip.hosts.mitsuba.emitters import (
     default_environment,
@@ -32,6 +33,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     integrator = _path_tracer(t, scene.integrator)
     lights = 0
     surroundings: list[tuple[Node, bool]] = []
+    hidden = _hidden_lights(scene.primitives)
     for number, primitive in enumerate(scene.primitives):
         t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
         match primitive:
@@ -39,7 +41,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
                 node = point_node(t, primitive)
             case ts.InfiniteSphere() | ts.InfiniteSphereCap() | ts.Skydome():
                 node = environment_node(t, primitive)
-                if node is not None:
+                if node is not None and primitive not in hidden:
                     surroundings.append((node, isinstance(primitive, ts.InfiniteSphereCap)))
                 continue
             case _:
@@ -63,14 +65,30 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     )
 
 
+def _hidden_lights(primitives: Sequence[ts.Primitive]) -> set[ts.Primitive]:
+    """Return the lights around the scene that nothing finds: not sampled, and behind a later one."""
+    hidden: set[ts.Primitive] = set()
+    is_covered = False
+    for primitive in reversed(primitives):
+        if isinstance(primitive, ts.InfiniteSphere | ts.InfiniteSphereCap | ts.Skydome):
+            if is_covered and not primitive.sample:
+                hidden.add(primitive)
+            is_covered |= not isinstance(primitive, ts.InfiniteSphereCap)
+    return hidden
+
+
 def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
     """Return the path tracer that converges to the picture of an integrator."""
-    if isinstance(integrator, ts.PathTracer):
+    if isinstance(integrator, ts.PathTracer) and integrator.kind == ts.PathTracer.kind:
         return integrator
     if isinstance(integrator, ts.LightTracer):
         raise t.unsupported("a light_tracer, which shows no mirrors,")
     _log.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
+    kept = {}
+    if isinstance(integrator, ts.PathTracer | ts.PhotonMap):
+        kept = {name: getattr(integrator, name) for name in ("low_order_scattering", "include_surfaces")}
     return ts.PathTracer(
+        **kept,
         min_bounces=integrator.min_bounces,
         max_bounces=integrator.max_bounces,
         enable_consistency_checks=integrator.enable_consistency_checks,

@@ -17,9 +17,8 @@ class TranslatedScene:
     picture's; its reconstruction filter and the sensor's sampler are not used.
 
     ``albedo`` maps the id of every BSDF that a shape carries (the outermost one: a "twosided", "mask" or
-    "tungsten_bump" around it counts) to the texture that Tungsten calls the albedo of that BSDF: a dictionary
-    of a Mitsuba texture, or a reference ``{"type": "ref", "id": ...}`` to one in ``scene``. The id of a BSDF
-    is its key in ``scene``.
+    "tungsten_bump" around it counts) to the texture that Tungsten calls the albedo of that BSDF, as
+    `mitsuba.load_dict` takes it. The id of a BSDF is its key in ``scene``.
 
     ``reconstruction_filter`` is Tungsten's, whose samples are distributed by the filter instead of weighted
     by it. ``pixel_center`` is where the filter is centred in a pixel: 0.5, but 0 for Tungsten's thin lens.
