@@ -56,7 +56,6 @@ def test_examples_are_read_without_a_warning(path, caplog):
     scene = load_scene(path)
     assert scene.primitives
     assert scene.path == path
-    assert scene.raw == json.loads(path.read_text())
     assert not scene.renderer.output_buffers
     assert not caplog.records
 
@@ -392,11 +391,6 @@ def test_instances(load):
     assert [master.kind for master in found.masters] == ["cube", "sphere"]
     assert [placement.id for placement in found.instances] == [1, 0]
     np.testing.assert_array_equal(found.instances[0].world_from_local[:3, 3], [1, 2, 3])
-
-
-def test_the_json_stays_at_hand(load):
-    raw = sphere(bsdf={"type": "null"}, anything=[1])
-    assert json.dumps(load(raw).raw) == json.dumps(raw)
 
 
 # --- Everything that can be wrong ---

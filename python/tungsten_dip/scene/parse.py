@@ -200,7 +200,7 @@ class _Parser:
             logger.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
         for error in self.missing:
             logger.warning("%s (ignored: nothing uses it)", error)
-        return Scene(path=self.path, raw=raw, **parts)
+        return Scene(path=self.path, **parts)
 
     # --- Values by annotation ---
 

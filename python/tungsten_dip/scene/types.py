@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -950,13 +950,9 @@ class Renderer:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A scene file.
-
-    ``path`` is where it was read from; ``raw`` is its JSON, for hosts that write a changed copy.
-    """
+    """A scene file; ``path`` is where it was read from."""
 
     path: Path
-    raw: dict[str, Any] = field(repr=False)
     media: tuple[Medium, ...] = ()
     bsdfs: tuple[Bsdf, ...] = ()
     primitives: tuple[Primitive, ...] = ()
