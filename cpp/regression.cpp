@@ -377,12 +377,10 @@ class Regression {
         scratch.distances.resize(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns));
         float* row = scratch.distances.data();
         for (int y = tile.y - r; y < tile.y + tile.height + r; ++y, row += columns) {
-            // Rows beyond the margin belong to neighbours outside of the image, whose weight becomes 0.
-            const int neighbour_y = std::clamp(y + dy, -r, target_.height() - 1 + r);
             const std::ptrdiff_t p = tile.x - r;
             const std::ptrdiff_t q = p + dx;
-            compare_rows(guide_.row(0, y) + p, guide_.row(0, neighbour_y) + q, guide_variance_.row(0, y) + p,
-                         guide_variance_.row(0, neighbour_y) + q, guide_.plane_size(), guide_.channels(),
+            compare_rows(guide_.row(0, y) + p, guide_.row(0, y + dy) + q, guide_variance_.row(0, y) + p,
+                         guide_variance_.row(0, y + dy) + q, guide_.plane_size(), guide_.channels(),
                          window_.k * window_.k, columns, row);
         }
         for (int i = 0; i < tile.height; ++i) {

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from tungsten_dip.fit.networks import LEAKY_SLOPE
+from tungsten_dip.fit.published import LEAKY_SLOPE
 from tungsten_dip.fit.paper import (
     AVERAGE_WEIGHT,
     BACKTRACK_DB,

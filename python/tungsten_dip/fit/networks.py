@@ -16,8 +16,14 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-LEAKY_SLOPE = 0.2
-"""Slope of the leaky ReLU below zero (published code)."""
+from tungsten_dip.fit.published import (
+    LEAKY_SLOPE,
+    NORM_EPSILON,
+    RESNET_BLOCKS,
+    RESNET_WIDTH,
+    SIDE_CHANNELS,
+    SIDE_SCALES,
+)
 
 Pointwise = Callable[[Tensor], Tensor]
 """A function that treats every pixel alike and by itself."""
@@ -26,36 +32,25 @@ Pointwise = Callable[[Tensor], Tensor]
 class Skip(nn.Module):
     """Encoder and decoder with connections across at the coarse scales.
 
-    ``channels`` are the counts from the finest scale to the coarsest, down and up alike; ``skip_channels``
-    those of the connections across (0: none), by default 4 at the two coarsest scales. ``final`` maps what
-    the last convolution gives to output values. The input is mirrored up to a multiple of 2**scales and the
-    output cropped back.
+    ``channels`` are the counts from the finest scale to the coarsest, down and up alike. The input is
+    mirrored up to a multiple of 2**scales and the output cropped back.
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        out_channels: int = 3,
-        channels: tuple[int, ...] = (8, 16, 32, 64, 128),
-        skip_channels: tuple[int, ...] | None = None,
-        final: Pointwise = torch.sigmoid,
+        self, in_channels: int, out_channels: int = 3, channels: tuple[int, ...] = (8, 16, 32, 64, 128)
     ) -> None:
         super().__init__()
         scales = len(channels)
-        if skip_channels is None:
-            skip_channels = ((0,) * scales + (4, 4))[-scales:]
+        across = tuple(SIDE_CHANNELS if scale >= scales - SIDE_SCALES else 0 for scale in range(scales))
         sources = (in_channels, *channels[:-1])
         deeper = (*channels[1:], channels[-1])
         self.down = nn.ModuleList(_Down(i, o) for i, o in zip(sources, channels, strict=True))
         self.side = nn.ModuleList(
             _Side(i, s) if s else None  # type: ignore[misc]  # torch takes None as well
-            for i, s in zip(sources, skip_channels, strict=True)
+            for i, s in zip(sources, across, strict=True)
         )
-        self.up = nn.ModuleList(
-            _Up(s + d, o) for s, d, o in zip(skip_channels, deeper, channels, strict=True)
-        )
+        self.up = nn.ModuleList(_Up(s + d, o) for s, d, o in zip(across, deeper, channels, strict=True))
         self.head = nn.Conv2d(channels[0], out_channels, 1)
-        self.final = final
         self.multiple = 2**scales
 
     def forward(self, image: Tensor) -> Tensor:
@@ -71,22 +66,16 @@ class Skip(nn.Module):
         for up, across in coarse:
             x = up(x, across)
         up, across = finest
-        x = cast(Tensor, up(x, across, then=lambda y: self.final(self.head(y))))
+        x = cast(Tensor, up(x, across, then=lambda y: torch.sigmoid(self.head(y))))
         return x[:, :, :height, :width]
 
 
 class ResNet(nn.Module):
     """Residual blocks at full resolution: conv, norm, leaky ReLU, conv, norm, plus the identity."""
 
-    def __init__(
-        self,
-        in_channels: int,
-        out_channels: int = 3,
-        blocks: int = 10,
-        width: int = 32,
-        final: Pointwise = torch.sigmoid,
-    ) -> None:
+    def __init__(self, in_channels: int, out_channels: int = 3) -> None:
         super().__init__()
+        width = RESNET_WIDTH
         self.first = _MirroringConv(in_channels, width)
         self.blocks = nn.ModuleList(
             nn.Sequential(
@@ -95,11 +84,10 @@ class ResNet(nn.Module):
                 nn.Conv2d(width, width, 3, padding=1, bias=False),
                 _Norm(width),
             )
-            for _ in range(blocks)
+            for _ in range(RESNET_BLOCKS)
         )
         self.gather = nn.Sequential(nn.Conv2d(width, width, 3, padding=1), _Norm(width))
         self.last = _MirroringConv(width, out_channels)
-        self.final = final
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (batch, in_channels, height, width) to (batch, out_channels, height, width)."""
@@ -107,7 +95,7 @@ class ResNet(nn.Module):
         x = F.leaky_relu_(self.first(mirror_to_multiple(image, 1, at_least=2)), LEAKY_SLOPE)
         for block in self.blocks:
             x = x + block(x)
-        return self.final(self.last(self.gather(x)))[:, :, :height, :width]
+        return torch.sigmoid(self.last(self.gather(x)))[:, :, :height, :width]
 
 
 def mirror_to_multiple(image: Tensor, multiple: int, at_least: int) -> Tensor:
@@ -126,7 +114,7 @@ class _Norm(nn.BatchNorm2d):
     """Batch norm that keeps no running statistics."""
 
     def __init__(self, channels: int) -> None:
-        super().__init__(channels, track_running_stats=False)
+        super().__init__(channels, NORM_EPSILON, track_running_stats=False)
 
 
 class _NormAct(_Norm):

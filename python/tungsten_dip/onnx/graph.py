@@ -16,15 +16,17 @@ from onnx import TensorProto
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.planes import LARGEST_INPUT
-from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE
+from tungsten_dip.fit.pointwise import HIDDEN
+from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
+from tungsten_dip.fit.published import (
+    LEAKY_SLOPE,
+    NORM_EPSILON,
+    RESNET_BLOCKS,
+    RESNET_WIDTH,
+    SIDE_CHANNELS,
+    SIDE_SCALES,
+)
 from tungsten_dip.graphs.builder import GraphBuilder
-
-_NORM_EPSILON = 1e-5
-_RESNET_BLOCKS = 10
-_RESNET_WIDTH = 32
-_SIDE_CHANNELS = 4
-_SIDE_SCALES = 2
-"""So many of the coarsest scales have a connection across."""
 
 
 def graph_of(model: Model, metadata: dict[str, str]) -> onnx.ModelProto:
@@ -76,8 +78,8 @@ class _Network(GraphBuilder):
         centred = self.add("Cast", centred, to=TensorProto.FLOAT)
         x = self.add("Div", centred, self.constant("std", std.reshape(-1, 1, 1)))
         x = self.add("Clip", x, self.number(-LARGEST_INPUT), self.number(LARGEST_INPUT))
-        x = self.leaky(self.conv(x, "layer1", planes, HIDDEN))
-        x = self.leaky(self.conv(x, "layer2", HIDDEN, HIDDEN))
+        x = self.leaky(self.conv(x, "layer1", planes, HIDDEN), POINTWISE_SLOPE)
+        x = self.leaky(self.conv(x, "layer2", HIDDEN, HIDDEN), POINTWISE_SLOPE)
         x = self.add("Softmax", self.conv(x, "layer3", HIDDEN, choices), axis=1)
         mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "pilots")
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
@@ -89,10 +91,10 @@ class _Network(GraphBuilder):
         x = self.mirrored("inputs", 2**scales, at_least=2 ** (scales + 1))
         sides: list[str | None] = []
         for scale, (before, after) in enumerate(zip(sources, channels, strict=True)):
-            across = scale >= scales - _SIDE_SCALES
+            across = scale >= scales - SIDE_SCALES
             side = f"side.{scale}"
             sides.append(
-                self.norm_act(self.conv(x, f"{side}.0", before, _SIDE_CHANNELS), f"{side}.1", _SIDE_CHANNELS)
+                self.norm_act(self.conv(x, f"{side}.0", before, SIDE_CHANNELS), f"{side}.1", SIDE_CHANNELS)
                 if across
                 else None
             )
@@ -114,7 +116,7 @@ class _Network(GraphBuilder):
             side_of_scale = sides[scale]
             if side_of_scale is not None:
                 x = self.add("Concat", side_of_scale, x, axis=1)
-                coming += _SIDE_CHANNELS
+                coming += SIDE_CHANNELS
             x = self.norm(x, f"{up}.norm", coming)
             x = self.padded(x, "edge" if side_of_scale is None else "reflect")
             x = self.conv(x, f"{up}.conv", coming, after, size=3)
@@ -124,10 +126,10 @@ class _Network(GraphBuilder):
 
     def resnet(self, planes: int, outputs: int) -> None:
         """Residual blocks, as `tungsten_dip.fit.networks.ResNet` with its defaults."""
-        width = _RESNET_WIDTH
+        width = RESNET_WIDTH
         x = self.padded(self.mirrored("inputs", 1, at_least=2), "reflect")
         x = self.leaky(self.conv(x, "first", planes, width, size=3))
-        for block in (f"blocks.{index}" for index in range(_RESNET_BLOCKS)):
+        for block in (f"blocks.{index}" for index in range(RESNET_BLOCKS)):
             y = self.conv(self.padded(x, "constant"), f"{block}.0", width, width, size=3, bias=False)
             y = self.padded(self.norm_act(y, f"{block}.1", width), "constant")
             y = self.conv(y, f"{block}.2", width, width, size=3, bias=False)
@@ -160,7 +162,7 @@ class _Network(GraphBuilder):
         )
         offset = self.add("Sub", x, self.pixel_mean(x))
         variance = self.pixel_mean(self.add("Mul", offset, offset))
-        std = self.add("Sqrt", self.add("Add", variance, self.number(_NORM_EPSILON)))
+        std = self.add("Sqrt", self.add("Add", variance, self.number(NORM_EPSILON)))
         return self.add("Add", self.add("Mul", offset, self.add("Div", weight, std)), shift)
 
     def pixel_mean(self, x: str) -> str:
@@ -169,9 +171,9 @@ class _Network(GraphBuilder):
         rows = self.add("ReduceMean", x, self.integers(3))
         return self.add("ReduceMean", rows, self.integers(2))
 
-    def leaky(self, x: str) -> str:
+    def leaky(self, x: str, slope: float = LEAKY_SLOPE) -> str:
         """Apply a leaky ReLU."""
-        return self.add("LeakyRelu", x, alpha=LEAKY_SLOPE)
+        return self.add("LeakyRelu", x, alpha=slope)
 
     def norm_act(self, x: str, name: str, channels: int) -> str:
         """Normalise, then leaky ReLU."""

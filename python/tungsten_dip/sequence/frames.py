@@ -48,7 +48,7 @@ def find_frames(
     the camera stands still. Of ``numbers``, every one is a frame, whether its files exist or not; None means
     what is there.
 
-    Raises InputError if a pattern has no place for a number, nothing matches it, or two frames are the same.
+    Raises InputError if a pattern has no place for a number, or nothing matches it.
     """
     if not _NUMBER.search(outputs):
         raise InputError(f"{outputs}: expected a place for the frame's number, such as out/f####.exr")
@@ -67,8 +67,6 @@ def find_frames(
     for number, path in sorted(present.items()):
         scene = None if scenes is None else Path(_named(scenes, number))
         frames.append(Frame(number, path, Path(_named(outputs, number)), scene))
-    if len(frames) > 1 and frames[0].output == frames[1].output:
-        raise InputError(f"{outputs}: expected another name for every frame")
     return frames
 
 
