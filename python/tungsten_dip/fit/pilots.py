@@ -52,8 +52,9 @@ _STRAY = 4.0
 _STRAY_RADIUS = 2
 """Emission of one half so many times what the other half saw in the 5x5 pixels around was seen by chance."""
 
-_SAMPLES_OF_FIRST_WINDOW = 12
-"""About how many independent neighbours the 7x7 window of the first guide averages, used without halves."""
+_SAMPLES_OF_GUIDE = 12
+"""About how many independent pixels a guide of all samples averages: its noise, where no second half tells
+it, is that of the image divided by this."""
 
 
 @dataclass(frozen=True)
@@ -390,7 +391,7 @@ def _guides(
         noise = (guides[0] - guides[1]) ** 2 / 2
     else:
         squared = variance / guidance.albedo**2 if variance is not None else (irradiances[0] - images[0]) ** 2
-        noise = squared / (_SAMPLES_OF_FIRST_WINDOW * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
+        noise = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
     noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, guidance.threads)
     return Guides(guides, noise + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
 

@@ -30,7 +30,26 @@ from tungsten_dip.fit.neighbours import mean_around
 PLANES_RADIUS = max(SCORE_RADII)
 LARGEST_INPUT = 4.0
 
+# What the planes are made with is part of every saved network (`onnx.file` numbers the format): errors are
+# relative to the squared radiance, brightness is in units of the evidence.
 _LOG_OFFSET = 0.02
+"""Darker is as dark, to the logarithm of a brightness."""
+
+_LEAST_ERROR = 1e-4
+"""Smaller errors, 1% of the radiance, do not differ."""
+
+_LEAST_CAP = 1e-3
+"""Of the errors that count in full: where there is no noise, nothing is an outlier up to here."""
+
+_LARGEST_BRIGHTNESS = 2.0
+"""Pilots more than e^2 times brighter than the reference, or darker, are as far off."""
+
+_SCORE_UNIT = 0.05
+"""A pilot that is worse than the reference by this part of the noise scores 1, ..."""
+
+_LARGEST_SCORE = 3.0
+"""... and this is the worst score."""
+
 _LEAST_SPREAD = 1e-6
 _PART_PIXELS = 1 << 11
 _LEAST_NOISE = 1.0
@@ -61,13 +80,13 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     for name in layout.features:
         yield evidence.features[half][name]
     noise = evidence.noises[half]
-    yield np.log(noise + np.float32(1e-4))[:, :, 0]
+    yield np.log(noise + np.float32(_LEAST_ERROR))[:, :, 0]
     base = _log_level(evidence.pilots[layout.reference][half])
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
     denominator = denominators_of(evidence.smooth)[half]
-    cap = np.float32(OUTLIER) * noise + np.float32(1e-3)
+    cap = np.float32(OUTLIER) * noise + np.float32(_LEAST_CAP)
     reference = np.minimum(squared_error(evidence.pilots[layout.reference][half], other, denominator), cap)
     for index, pilot in enumerate(evidence.pilots):
         if index == layout.reference:
@@ -76,11 +95,12 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
         if index == 0:
             # Its own noise aside: else a noisy pixel is chosen for being dark by chance.
             shown = np.maximum(mean_around(shown, 1, threads), 0)
-        yield np.clip(_log_level(shown) - base, -2, 2)[:, :, 0]
+        yield np.clip(_log_level(shown) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
         worse = np.minimum(squared_error(pilot[half], other, denominator), cap) - reference
         for radius in SCORE_RADII:
-            score = mean_around(worse, radius, threads) / (np.float32(0.05) * noise + np.float32(1e-4))
-            yield np.clip(score, -3, 3)[:, :, 0]
+            unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
+            score = mean_around(worse, radius, threads) / unit
+            yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]
 
 
 def network_inputs(evidence: Evidence) -> FloatArray:
