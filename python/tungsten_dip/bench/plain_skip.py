@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from tungsten_dip.fit.published import LEAKY_SLOPE
 from tungsten_dip.fit.paper import (
     AVERAGE_WEIGHT,
     BACKTRACK_DB,
@@ -20,6 +19,7 @@ from tungsten_dip.fit.paper import (
     LEARNING_RATE,
     learning_rate,
 )
+from tungsten_dip.fit.published import LEAKY_SLOPE
 
 
 class PlainSkip(nn.Module):
