@@ -269,9 +269,10 @@ def test_peers_that_are_missing_are_left_out_and_that_is_said(bench_set, fits, t
     for module in ("fit", "fit.oidn"):
         monkeypatch.setattr(f"tungsten_dip.{module}.find_spec", lambda name: None)
     with caplog.at_level(logging.INFO):
-        plan = replace(QUICK, kinds=("paper", "oidn", "nfor", "samples"), repeats=1)
+        plan = replace(QUICK, kinds=("presets", "paper", "oidn", "nfor", "samples"), repeats=1)
         (found,) = run_pareto([bench_set], plan, tmp_path)
-    assert [row.label for row in found.rows] == ["noisy"]
+    assert [row.label for row in found.rows] == ["noisy", *QUICK.presets]
+    assert "measured without more samples" in caplog.text
     assert "pip install 'tungsten-dip[fit]'" in caplog.text
     assert "pip install 'tungsten-dip[oidn]'" in caplog.text
     assert "NFOR is left out" in caplog.text
@@ -330,6 +331,7 @@ def test_plans_that_cannot_be_followed_are_refused(bench_set, tmp_path, capfd, f
     refused(capfd, [*command_line, "--methods", "magic"], "expected some of presets", "magic")
     refused(capfd, [*command_line, "--presets", "magic"], "expected some of draft", "magic")
     refused(capfd, [*command_line, "--budgets", "1s,soon"], "duration", "soon")
+    refused(capfd, [*command_line, "--methods", "samples"], "nothing to compare", "--scene")
     assert not (tmp_path / "out").exists()
     file = tmp_path / "file"
     file.touch()

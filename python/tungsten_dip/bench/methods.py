@@ -115,6 +115,11 @@ def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]
     for index, bench_set in enumerate(sets):
         scene = plan.scenes[index] if plan.scenes else None
         methods[bench_set.name] = list(_methods(bench_set, plan, scene))
+        if len(methods[bench_set.name]) == 1:
+            raise InputError(
+                f"{bench_set.name}: nothing to compare the noisy image with; install what the methods need, "
+                "give --scene for more samples, or name other methods"
+            )
     return methods
 
 
@@ -163,8 +168,11 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None) -> Iterator[Me
             yield _oidn(bench_set, quality, plan.threads)
     if "nfor" in plan.kinds:
         yield from _nfor(bench_set, plan)
-    if "samples" in plan.kinds and scene is not None:
-        yield from _samples(bench_set, plan, scene)
+    if "samples" in plan.kinds:
+        if scene is not None:
+            yield from _samples(bench_set, plan, scene)
+        else:
+            _LOG.info("%s: measured without more samples: no scene is given", bench_set.name)
 
 
 def _ours(

@@ -27,8 +27,8 @@ def run_pareto(
     Raises InputError if the folder holds something else, or a method cannot be run.
     """
     require_matplotlib()
-    runner = Runner(folder, plan.threads)
     methods = methods_for(sets, plan)
+    runner = Runner(folder, plan.threads)
     tasks = runner.missing(
         [
             Task(bench_set, method, repeat)
