@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -12,6 +14,26 @@ from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 
 SAMPLE_SHAPE = 0.5
 """Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""
+
+
+OPTIONAL = (
+    "torch",
+    "mitsuba",
+    "pyoidn",
+    "distributed",
+    "matplotlib",
+    "flip_evaluator",
+    "skimage",
+    "playwright",
+)
+"""What some tests need, and are skipped without; where CI runs them, nothing may be missing."""
+
+
+def pytest_configure() -> None:
+    """Refuse to skip on a machine that is there to test everything."""
+    missing = [name for name in OPTIONAL if find_spec(name) is None]
+    if missing and os.environ.get("CI"):
+        raise pytest.UsageError(f"CI is set, and {', '.join(missing)} is not installed")
 
 
 @dataclass(frozen=True)
