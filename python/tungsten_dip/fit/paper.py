@@ -86,9 +86,9 @@ class PaperFit:
             state = {name: torch.from_numpy(weight) for name, weight in warm_start.weights.items()}
             self.network.load_state_dict(state)
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._weights: list[Tensor] = list(self.network.parameters())
-        self._good_weights = [weight.detach().clone() for weight in self._weights]
-        self._optimizer = torch.optim.Adam(self._weights, lr=LEARNING_RATE, fused=True)
+        self._weights = _as_one_vector(self.network)
+        self._good_weights = self._weights.clone()
+        self._optimizer = torch.optim.Adam([self._weights], lr=LEARNING_RATE, fused=True)
 
     def step(self) -> None:
         """Do one iteration."""
@@ -105,18 +105,16 @@ class PaperFit:
         color_loss = self.loss if seen.shape[1] == 3 else F.mse_loss(seen[:, :3], self._wanted[:, :3]).item()
         self.psnr = -10 * math.log10(max(color_loss, 1e-12))
         if not self.psnr >= self._last_good_psnr - BACKTRACK_DB:
-            with torch.no_grad():
-                torch._foreach_copy_(self._weights, self._good_weights)
+            self._weights.copy_(self._good_weights)
             return
-        with torch.no_grad():
-            torch._foreach_copy_(self._good_weights, self._weights)
+        self._good_weights.copy_(self._weights)
         self._last_good_psnr = self.psnr
         if self._average is None:
             self._average = seen.clone()
         else:
             self._average.lerp_(seen, 1 - AVERAGE_WEIGHT)
 
-        self._optimizer.zero_grad()
+        self._optimizer.zero_grad(set_to_none=False)
         loss.backward()  # type: ignore[no-untyped-call]
         self._optimizer.param_groups[0]["lr"] = learning_rate(self.loss)
         self._optimizer.step()
@@ -219,6 +217,29 @@ def _notes_on_method(buffers: RenderBuffers, settings: FitSettings) -> list[str]
     if settings.scheme == "ioc":
         notes.append("scheme ioc: the input is random, whatever inputs says")
     return notes
+
+
+def _as_one_vector(network: nn.Module) -> Tensor:
+    """Make all weights views of one vector, which is returned, and their gradients views of its gradient.
+
+    Steps, copies and zeros are then one loop each in place of one for every weight. Weights of convolutions
+    keep their channels last in memory.
+    """
+    weights = list(network.parameters())
+    vector = torch.empty(sum(weight.numel() for weight in weights), device=weights[0].device)
+    vector.grad = torch.zeros_like(vector)
+    first = 0
+    for weight in weights:
+        part = slice(first, first + weight.numel())
+        view, gradient = (
+            whole[part].view(weight.movedim(1, -1).shape).movedim(-1, 1)
+            if weight.dim() == 4
+            else whole[part].view(weight.shape)
+            for whole in (vector, vector.grad)
+        )
+        weight.data, weight.grad = view.copy_(weight.data), gradient
+        first = part.stop
+    return vector
 
 
 def _nchw(image: Tensor) -> Tensor:
