@@ -2,6 +2,6 @@
 
 import sys
 
-from tungsten_dip.cli.tungsten_dip import main
+from tungsten_dip.cli.entry import tungsten_dip
 
-sys.exit(main())
+sys.exit(tungsten_dip())

@@ -24,7 +24,7 @@ from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.progress import silent
-from tungsten_dip.report.metrics import Comparison
+from tungsten_dip.report.metrics import Comparison, compare
 
 DENOISER = "TUNGSTEN_DENOISER"
 """Names Tungsten's command denoiser, where there is one."""
@@ -408,3 +408,18 @@ def test_nfor_of_tungsten_denoises(render):
     image = nfor_image(render.buffers, Path(os.environ[DENOISER]))
     noisy = render.buffers.color.mean
     assert np.mean((image - render.reference) ** 2) < 0.5 * np.mean((noisy - render.reference) ** 2)
+
+
+def test_sets_whose_names_look_alike_keep_their_own_images(tmp_path, make_render, fits):
+    folders = []
+    for name, seed in (("a_b", 1), ("a-b", 2)):
+        render = make_render(seed=seed)
+        write_tungsten_folder(tmp_path / name, render.buffers)
+        write_image(tmp_path / name / "reference.exr", render.reference)
+        folders.append(str(tmp_path / name))
+    plan = replace(QUICK, kinds=("presets",), repeats=1)
+    one, other = run_pareto(read_sets(folders), plan, tmp_path / "out")
+    for found in (one, other):
+        row = next(row for row in found.rows if row.label == "draft")
+        assert row.median is not None
+        assert compare(row.image, found.bench_set.reference).psnr == pytest.approx(row.median.psnr, abs=1e-3)

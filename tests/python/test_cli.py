@@ -2,8 +2,11 @@ import json
 import logging
 import os
 import shlex
+import signal
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO
@@ -16,6 +19,7 @@ from tungsten_dip.cli import tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import silent
 from tungsten_dip.sequence.following import Followed
 
@@ -603,3 +607,93 @@ def test_a_name_that_is_no_text_is_refused_in_a_line(tmp_path, render, capfd):
     _, errors = capfd.readouterr()
     assert "expected a name in UTF-8; rename it" in errors
     assert len(errors.splitlines()) == 1
+
+
+def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkeypatch):
+    scenes = [write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png") for name in ("one", "two")]
+    finished = tungsten_dip.fit.denoise
+    monkeypatch.setattr(
+        "tungsten_dip.fit.denoise",
+        lambda *given, **more: replace(finished(*given, **more), interrupted=True),
+    )
+    assert tungsten.main(["--dip-denoise", "-o", str(tmp_path / "one.png"), str(scenes[0])]) == 130
+    assert (tmp_path / "one_denoised.exr").exists()
+    frames = []
+
+    class Follower:
+        def __init__(self, *given, **more):
+            pass
+
+        def denoise(self, buffers, camera, progress):
+            frames.append(buffers)
+            return Followed(replace(finished(buffers), interrupted=True), "fitted")
+
+    monkeypatch.setattr("tungsten_dip.sequence.following.Follower", Follower)
+    assert tungsten.main(["--dip-denoise", "--host", "mitsuba", *map(str, scenes)]) == 130
+    assert len(frames) == 1
+
+
+def test_options_may_stand_between_scenes(tmp_path, renders):
+    scenes = [write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png") for name in ("one", "two")]
+    assert tungsten.main([str(scenes[0]), "-t", "1", str(scenes[1])]) == 0
+    assert (tmp_path / "two.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("renderer", "options", "words"),
+    [
+        ({"timeout": "abc"}, [], ("renderer.timeout", "duration", "abc")),
+        ({}, ["--spp", "9" * 10], ("spp", "9" * 10)),
+    ],
+)
+def test_numbers_that_mitsuba_cannot_take(tmp_path, capfd, renderer, options, words):
+    path = write_scene(tmp_path / "scene.json", **renderer)
+    assert tungsten.main([*options, "--host", "mitsuba", str(path)]) == 2
+    fails(capfd, 2, *words)
+
+
+@pytest.mark.parametrize("plane", ["color", "colorA", "normalVariance"])
+def test_buffers_are_not_written_over(folder, tmp_path, fits, capfd, plane):
+    path = folder / f"{plane}.exr"
+    before = path.read_bytes()
+    for options in (["-o", str(path)], ["-o", str(tmp_path / "o.exr"), "--error-map", str(path)]):
+        assert command.main(["denoise", str(folder), *options]) == 2
+        fails(capfd, 2, str(path), "one of the buffers")
+    assert path.read_bytes() == before
+    single = tmp_path / "single.exr"
+    assert command.main(["denoise", str(folder), "-o", str(single)]) == 0
+    assert command.main(["denoise", str(single), "-o", str(single)]) == 0  # all layers are in the result
+
+
+def test_a_stdout_that_is_full_is_named(folder, tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", MAIN.format("tungsten_dip"), "inspect", str(folder)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.returncode == 2
+    assert "stdout: cannot be written" in done.stderr
+
+
+def test_ctrl_c_while_libraries_load_is_one_line():
+    program = (
+        "import signal; from tungsten_dip.cli import entry\n"
+        "with entry._leaving_on_interrupt('tungsten'): signal.raise_signal(signal.SIGINT)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "tungsten: interrupted\n")
+
+
+def test_ctrl_c_waits_for_an_import():
+    reached = []
+
+    def load():
+        with held_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            reached.append("the end")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert reached == ["the end"]

@@ -559,3 +559,11 @@ def test_any_mix_of_channel_names_reads_or_is_refused(tmp_path: Path, names: lis
     for name, channel in buffers.source.parts[0].channels.items():
         assert channel.tobytes() == channels[name].tobytes()
         assert channel.dtype == np.float16
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
+def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> None:
+    write_image(tmp_path / "a.png", np.ones((3, 4, 3), np.float32))
+    (tmp_path / "a.png").rename(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError, match="no linear radiance"):
+        read_image(tmp_path / f"a{suffix}")

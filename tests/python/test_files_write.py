@@ -412,3 +412,30 @@ def test_what_cannot_be_written_is_known_before(tmp_path: Path) -> None:
     for suffix in (".exr", ".png", ".gif"):
         with pytest.raises(InputError, match=r"cannot be written|ends in"):
             write_image(tmp_path / "none" / f"a{suffix}", noise((2, 2, 3)))
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])
+@pytest.mark.parametrize("missing", [1, 1000])
+def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path: Path, suffix: str, missing: int) -> None:
+    image = np.random.default_rng(0).random((80, 90, 3)).astype(np.float32)
+    path = tmp_path / f"a{suffix}"
+    write_image(path, image)
+    room = path.stat().st_size - missing
+    path.write_bytes(b"old")
+    program = (
+        "import resource, signal, sys, numpy as np; from tungsten_dip.buffers import write_image\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))\n"
+        "write_image(sys.argv[1], np.random.default_rng(0).random((80, 90, 3)).astype(np.float32))"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True)
+    assert "InputError" in done.stderr
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"old"]
+
+
+def test_a_loop_of_links_cannot_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "loop.exr"
+    path.symlink_to(path)
+    for attempt in (lambda: check_writable(path), lambda: write_image(path, noise((2, 2, 3)))):
+        with pytest.raises(InputError, match="cannot be written"):
+            attempt()

@@ -155,3 +155,10 @@ def test_ssim_of_uniform_images_compares_their_levels_alone():
     images = [np.full((16, 16, 3), level**2.2, dtype=np.float32) for level in (low, high)]
     c1 = 0.01**2
     assert compare(*images).ssim == pytest.approx((2 * low * high + c1) / (low**2 + high**2 + c1), rel=1e-4)
+
+
+@pytest.mark.parametrize("level", [1e-9, 1e-7, 1e-6, 1.0])
+def test_dark_references_have_no_exposures_for_flip(level: float) -> None:
+    reference = (level * np.random.default_rng(0).random((16, 16, 3))).astype(np.float32)
+    hdrflip = compare(reference * np.float32(1.1), reference).hdrflip
+    assert (hdrflip is None) == (level < 5e-7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -942,3 +943,14 @@ def test_save_and_warm_start_on_the_command_line(
     assert command.main([*mean, "--save-model", str(tmp_path / "none.onnx")]) == 2
     assert "no network was fitted" in capfd.readouterr().err
     assert not (tmp_path / "none.onnx").exists()
+
+
+def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:
+    program = (
+        "from tungsten_dip.fit.pointwise import training_step\n"
+        "from tungsten_dip.graphs.sessions import session_from_proto\n"
+        "session_from_proto(training_step(2, 2), 1)"
+    )
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "ORT_"))}
+    subprocess.run([sys.executable, "-c", program], env={**kept, "HOME": str(tmp_path)}, check=True)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from moving_camera import HEIGHT, WIDTH, true_frame
@@ -312,3 +313,16 @@ def test_frames_without_halves_are_denoised_each_by_itself(tmp_path):
 def test_the_published_method_is_refused():
     with pytest.raises(InputError, match="preset paper"):
         Follower(FitSettings(preset="paper"))
+
+
+def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path):
+    with pytest.raises(InputError, match="iterations: expected a whole number"):
+        Follower(DRAFT, 2_000_000_000)
+    if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
+        with pytest.raises(InputError, match="device cuda"):
+            Follower(replace(DRAFT, device="cuda"))
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    model = Follower(DRAFT).denoise(frame.buffers).result.model
+    without = frame.buffers.with_quantities(normal=None)
+    with pytest.raises(InputError, match="the model was fitted with normal"):
+        Follower(DRAFT, models=Models(first=model)).denoise(without)

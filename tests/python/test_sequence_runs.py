@@ -236,7 +236,9 @@ def test_a_worker_killed_within_a_frame_loses_nothing(frames, cluster):
 def test_local_workers_do_what_one_does(frames, capsys):
     pytest.importorskip("distributed")
     assert main(arguments("--workers", "2", "--json", "--frames", "0-3,9")) == 2
-    assert "1 of 5 frames have no result: 9" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "1 of 5 frames have no result: 9" in err
+    assert "frame 9: " in err
     assert len(outputs(frames)) == COUNT
     # All are finished: no worker is needed, and what one process finds is the same.
     before = outputs(frames)
@@ -280,3 +282,38 @@ def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatc
         assert main(arguments("--scheduler", local.scheduler_address)) == 2
     assert "3 of 4 frames have no result: 1, 2, 3; the others are done" in capsys.readouterr().err
     assert list(outputs(frames)) == ["f0000.exr"]
+
+
+def test_a_saved_model_is_that_of_the_first_frame_and_stays(frames, capsys):
+    command = [*arguments("--save-model", "m.onnx")]
+    assert main(command) == 0
+    before = Path("m.onnx").read_bytes()
+    assert main(command) == 0
+    Path("out/f0003.exr").unlink()
+    assert main(command) == 0
+    assert "left as it is: frame 0 was finished before" in capsys.readouterr().err
+    assert Path("m.onnx").read_bytes() == before
+    Path("m.onnx").unlink()
+    assert main(command) == 2
+    assert "frame 0 was finished before" in capsys.readouterr().err
+    assert main(arguments("--save-model", "m.txt")) == 2
+    assert "ends in .onnx" in capsys.readouterr().err
+
+
+def test_json_tells_of_the_frames_that_are_done_where_others_are_not(frames, capfd):
+    assert main(arguments("--frames", "0,9", "--json")) == 2
+    out, err = capfd.readouterr()
+    first, other = json.loads(out)["frames"]
+    assert first["error"] is None
+    assert "f0009" in other["error"]
+    assert "frame 9: " in err
+    assert err.splitlines()[-1].endswith("1 of 2 frames have no result: 9; the others are done")
+
+
+def test_the_published_method_is_refused_before_a_worker_starts(frames, capsys):
+    pytest.importorskip("distributed")
+    command = [word if word != "draft" else "paper" for word in arguments("--workers", "2")]
+    assert main(command) == 2
+    err = capsys.readouterr().err
+    assert "preset paper" in err.splitlines()[-1]
+    assert "Traceback" not in err

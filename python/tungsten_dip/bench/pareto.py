@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from tungsten_dip.bench.plot import require_matplotlib, write_pareto_plot
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet, cropped
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
+from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.progress import Progress, silent
 
@@ -63,10 +65,20 @@ def run_pareto(
 
 def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
     """Load every library that is about to be measured, so that no measurement pays for it."""
+    height, width = bench_set.buffers.height, bench_set.buffers.width
+    middle = [slice(max(0, size // 2 - 32), size // 2 + 32) for size in (height, width)]
+    tiny = cropped(bench_set.buffers, (middle[0], middle[1]))
+    logging.disable()  # nobody asked for a picture of this
+    try:
+        _warm_up_with(tiny, plan, series)
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _warm_up_with(tiny: RenderBuffers, plan: Plan, series: Collection[str]) -> None:
     from tungsten_dip.fit import FitSettings, denoise
     from tungsten_dip.hosts import render
 
-    tiny = cropped(bench_set.buffers, (slice(16), slice(16)))
     if not {OURS, IN_TIME}.isdisjoint(series):
         denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
     if PAPER in series:

@@ -104,7 +104,8 @@ class Runner:
         )
 
     def _image_path(self, bench_set: BenchSet, label: str) -> Path:
-        name = re.sub(r"[^a-z0-9]+", "-", f"{bench_set.name} {label}".lower())
+        # Names alone do not tell sets apart: a folder may hold the measurements of several of one name.
+        name = re.sub(r"[^a-z0-9]+", "-", f"{bench_set.name} {bench_set.digest[:8]} {label}".lower())
         return self._folder / "images" / f"{name}.exr"
 
 

@@ -23,7 +23,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises InputError if the file system refuses (no such folder, read-only, full).
     """
-    target = path.resolve()
+    target = _resolved(path)
     temporary = _temporary(target)
     try:
         _remove_left_by_the_dead(target)
@@ -51,11 +51,18 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
     try:
         if path.is_dir():
             raise InputError(f"{path}: expected the name of a file, this is a folder")
-        temporary = _temporary(path.resolve())
+        temporary = _temporary(_resolved(path))
         temporary.open("xb").close()
         temporary.unlink()
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except RuntimeError as error:  # as Python 3.11 and 3.12 have it
+        raise InputError(f"{path}: cannot be written (a loop of links); {_REMEDY}") from error
 
 
 def _temporary(target: Path) -> Path:

@@ -33,6 +33,8 @@ RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
 MAX_PIXELS = 2**28
 """The largest image read: 16384 x 16384. One channel of it is 1 GiB of float32."""
 
+_PNG_END = b"IEND\xae\x42\x60\x82"
+
 # What the encoder decides anew, or what describes the encoding alone.
 _ENCODING = {"channels", "chunkCount", "compression", "lineOrder", "name", "tiles", "type", "version"}
 
@@ -138,6 +140,10 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         message = output.geterror()
         if not (written and closed) or message:
             raise OSError(_one_line(message))
+        # Or not at all: the last block is written by a close that tells nobody.
+        _decoded(temporary)
+        if suffix == ".png" and not temporary.read_bytes().endswith(_PNG_END):
+            raise OSError("the end of the file is missing")
 
 
 def _checked_name(path: Path) -> str:
@@ -181,6 +187,8 @@ def _part(path: Path, image: Any, index: int) -> Part:
     if spec.nchannels == 0:
         raise InputError(f"{path}: holds no channels; render it again")
     formats = [spec.channelformat(channel) for channel in range(spec.nchannels)]
+    if path.suffix.lower() in RADIANCE_SUFFIXES and not {"uint8", "uint16"}.isdisjoint(map(str, formats)):
+        raise InputError(f"{path}: holds no linear radiance but a picture of few bits; save it as .exr")
     channels: dict[str, Channel] = {}
     begin = 0
     while begin < spec.nchannels:

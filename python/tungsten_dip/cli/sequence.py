@@ -79,6 +79,8 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     check_writable(frames[0].output)
     if options.report is not None:
         check_writable(options.report, (".html",))
+    if options.save_model is not None:
+        check_writable(options.save_model, (".onnx",))
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
@@ -95,16 +97,17 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if options.report is not None:
         _write_report(options.report, options.input, records)
     if options.save_model is not None:
-        _save_model(options.save_model, models)
+        _save_model(options.save_model, models, records[0])
+    done = [record for record in records if not record.skipped and record.error is None]
+    seconds = sum(record.seconds for record in done)
+    facts: dict[str, Any] = {"frames": [asdict(record) for record in records]}
     failures = [record for record in records if record.error is not None]
     if failures:
         numbers_of = ", ".join(str(record.number) for record in failures)
         rest = "" if len(failures) == len(records) else "; the others are done"
-        raise InputError(f"{len(failures)} of {len(records)} frames have no result: {numbers_of}{rest}")
-    done = [record for record in records if not record.skipped]
-    seconds = sum(record.seconds for record in done)
-    facts = {"frames": [asdict(record) for record in records]}
-    before = "" if len(done) == len(records) else f"; {len(records) - len(done)} were finished before"
+        facts["error"] = f"{len(failures)} of {len(records)} frames have no result: {numbers_of}{rest}"
+    skipped = sum(record.skipped for record in records)
+    before = f"; {skipped} were finished before" if skipped else ""
     return facts, f"{len(done)} frames, denoised in {seconds:.1f} s in all{before}"
 
 
@@ -125,19 +128,29 @@ def _without_repetition() -> Iterator[None]:
 def _tell(record: Record) -> None:
     if record.skipped:
         log.info("frame %d: finished already: %s", record.number, record.output)
-    elif record.error is None:
+    elif record.error is not None:
+        log.error("frame %d: %s", record.number, record.error)
+    else:
         log.info(
             "frame %d: %s, %d steps, %.1f s: %s",
             record.number, record.how, record.iterations, record.seconds, record.output,
         )  # fmt: skip
 
 
-def _save_model(path: Path, models: Models) -> None:
+def _save_model(path: Path, models: Models, first: Record) -> None:
     """Save the network of the first frame, which other sequences may start from."""
     from tungsten_dip.onnx import save_model
 
+    if first.skipped:
+        # What the first of the remaining frames left behind is another network.
+        if not path.exists():
+            raise InputError(
+                f"{path}: not written: frame {first.number} was finished before; remove its result"
+            )
+        log.info("%s: left as it is: frame %d was finished before", path, first.number)
+        return
     if models.first is None:
-        raise InputError(f"{path}: not written: no frame was fitted, all were finished or had no halves")
+        raise InputError(f"{path}: not written: no frame was fitted, for want of halves")
     save_model(path, models.first)
 
 

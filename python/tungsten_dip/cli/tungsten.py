@@ -75,12 +75,14 @@ def denoise_outputs(
         write_model(save_model, result)
     for written in filter(None, (exr, png, pair, report, save_model)):
         log.info("wrote %s", written)
+    if result.interrupted:
+        raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
 
 
 def _run(arguments: Sequence[str] | None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     if not options.scenes:
         parser.print_help()
         return
@@ -300,10 +302,17 @@ def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Pr
         spp=options.spp,
         seed=options.seed or 0,
         threads=options.threads,
-        timeout_s=(minutes(scene.renderer.timeout) if options.timeout is None else options.timeout) or None,
+        timeout_s=(_timeout_of(scene) if options.timeout is None else options.timeout) or None,
         progress=progress,
         quantities=[name for name in CHANNELS if name in wanted],
     )
+
+
+def _timeout_of(scene: Scene) -> float:
+    try:
+        return minutes(scene.renderer.timeout)
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"{scene.path}: renderer.timeout: {error}; correct it") from None
 
 
 def _denoised_paths(outputs: SceneOutputs) -> tuple[Path, Path, Path]:

@@ -19,6 +19,7 @@ from tungsten_dip.buffers import (
     write_denoised,
     write_image,
 )
+from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.bench import add_bench
 from tungsten_dip.cli.console import (
     Parser,
@@ -63,9 +64,20 @@ def _run(arguments: Sequence[str] | None) -> None:
         if options.json:
             emit(facts)
         else:
-            print(text)
+            _print(text)
+    if "error" in facts:
+        raise InputError(facts["error"])
     if facts.get("interrupted"):
         raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
+
+
+def _print(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise InputError(f"stdout: cannot be written ({error.strerror}); the files are written") from error
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -167,6 +179,13 @@ def _denoised(
     if options.error_map is not None and options.error_map.resolve() == options.output.resolve():
         raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 
+    inputs = [file.resolve() for file in input_files(options.input, dict(options.map))]
+    for path in (options.output, options.error_map):
+        # One file that holds everything may be replaced: the result passes all of its layers through.
+        is_whole = path is options.output and inputs == [options.input.resolve()]
+        if path is not None and path.resolve() in inputs and not is_whole:
+            raise InputError(f"{path}: is one of the buffers that are read; name another file")
+
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, dict(options.map))
         result = denoise(buffers)
@@ -178,8 +197,8 @@ def _denoised(
     if options.error_map is not None:
         if result.error is None:
             raise InputError(
-                f"{options.error_map}: not written: the error is not known without halves A and B of the "
-                "colour; render with two_buffer_variance"
+                f"{options.error_map}: not written: the error is not known without independent halves of the "
+                "colour; render with two_buffer_variance, without stratified_sampler"
             )
         write_image(options.error_map, result.error)
 

@@ -16,6 +16,7 @@ from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
 
 _LOG = logging.getLogger(__name__)
@@ -80,7 +81,8 @@ def denoise(
     if settings.preset == "paper":
         if given or previous is not None:
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
-        from tungsten_dip.fit.paper import fit_paper
+        with held_interrupts():
+            from tungsten_dip.fit.paper import fit_paper
 
         result = fit_paper(buffers, settings, progress, warm_start)
     else:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, Literal
 
 import onnx
-import onnxruntime as ort
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.interrupts import held_interrupts
+
+# Read as it is imported: otherwise onnxruntime keeps a device id, and sends what it is used for to Microsoft.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+with held_interrupts():
+    import onnxruntime as ort
 
 Device = Literal["auto", "cpu", "cuda"]
 

@@ -20,6 +20,8 @@ DISPLAY_GAMMA = 2.2
 
 _METRIC_BY_PACKAGE = {"skimage": "SSIM", "flip_evaluator": "FLIP"}
 
+_FLIP_DARKEST = float(np.finfo(np.float32).eps)
+
 SSIM_WINDOW = 7
 """Side in pixels of the window in which Wang et al. 2004 compare, as scikit-image has it."""
 
@@ -113,8 +115,9 @@ def _ssim(x: FloatImage, r: FloatImage) -> float | None:
 
 def _hdrflip(x: FloatImage, r: FloatImage) -> float | None:
     luminance = r @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
-    # FLIP takes its exposures from the maximum down to the median and ends the process where these are equal.
-    if luminance.max() <= max(float(np.median(luminance)), 0) * (1 + 1e-4):
+    # FLIP takes its exposures from the maximum down to the median, or to the float's epsilon, and ends the
+    # process where these are equal.
+    if luminance.max() <= max(float(np.median(luminance)), _FLIP_DARKEST) * (1 + 1e-4):
         return None
     return _flip(x, r, "HDR")
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress, silent
-from tungsten_dip.sequence.following import Models
+from tungsten_dip.sequence.following import Follower, Models
 from tungsten_dip.sequence.frames import Frame
 from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
 
@@ -55,6 +56,7 @@ def denoise_on_cluster(
 
     Raises InputError if Dask is not installed or the scheduler does not answer.
     """
+    Follower(run.settings, run.refit, models)  # which checks them, before any worker starts
     frames = [_absolute(frame) for frame in frames]
     to_do, records = split_finished(frames, run)
     for record in records:
@@ -121,11 +123,15 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
         ) from error
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler == "local":
-        with (
-            dask.config.set(_LOCAL_WORKERS),
-            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
-            Client(cluster) as client,
-        ):
+        with dask.config.set(_LOCAL_WORKERS), ExitStack() as stack:
+            with _interrupts_blocked():
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
+                client = stack.enter_context(Client(stack.enter_context(cluster)))
             yield client
         return
     try:
@@ -142,6 +148,16 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
                 f"{scheduler}: the scheduler has no worker; start one with: dask worker {scheduler}"
             ) from error
         yield client
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Keep Ctrl-C back, from the processes that start meanwhile for good: it is this one that ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _absolute(frame: Frame) -> Frame:

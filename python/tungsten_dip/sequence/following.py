@@ -21,6 +21,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.graphs.sessions import check_device
 from tungsten_dip.onnx import inference
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
@@ -76,9 +77,12 @@ class Follower:
     def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models | None = None) -> None:
         """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
 
-        Raises InputError if the settings are those of the published method, which has no halves to follow, or
-        ask for another network than the first one's.
+        Raises InputError if the settings are those of the published method, which has no halves to follow,
+        ask for another network than the first one's or a device that is not there, or refit is out of range.
         """
+        check_device(settings.device)
+        if isinstance(refit, int) and refit:
+            replace(settings, iterations=refit)  # which checks it
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models or Models()
@@ -144,6 +148,8 @@ class Follower:
                     settings = replace(self._settings, iterations=steps)
                     result = fit.denoise(buffers, settings, progress, warm_start=model, previous=moved)
             except InputError as problem:
+                if last is None:
+                    raise  # The model was made for something else.
                 raise _CutError(str(problem)) from problem
         elif moved is not None:
             settings = replace(self._settings, iterations=_FIRST_FOLLOWING_STEPS)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
@@ -26,8 +25,6 @@ from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.sequence.following import Follower, Models, Refit
 from tungsten_dip.sequence.frames import Frame
-
-_LOG = logging.getLogger(__name__)
 
 _RECORD = OWN + "frame"
 """The attribute of a frame's file that holds its record."""
@@ -154,10 +151,8 @@ def _denoise(frame: Frame, run: Run, follower: Follower, progress: Progress) -> 
 
 
 def failed(frame: Frame, error: Exception) -> Record:
-    """Log why a frame has no result, and return its record."""
-    message = str(error)
-    _LOG.error("frame %d: %s", frame.number, message)
-    return Record(frame.number, str(frame.output), error=message)
+    """Return the record of a frame that has no result."""
+    return Record(frame.number, str(frame.output), error=str(error) or type(error).__name__)
 
 
 def _key(frame: Frame, run: Run) -> str:

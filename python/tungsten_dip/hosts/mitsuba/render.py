@@ -101,8 +101,8 @@ def render_translated(
     at least one is rendered, and the buffers tell the spp that were reached.
     """
     for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
-        if value is not None and value < 1:
-            raise InputError(f"{name}: expected a number above 0, got {value}")
+        if value is not None and not 1 <= value < 2**31:
+            raise InputError(f"{name}: expected a number from 1 to {2**31 - 1}, got {value}")
     if "color" not in quantities:
         raise InputError(f"quantities: expected color among them, got {', '.join(quantities)}")
     if not 0 <= seed < 2**32:

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.interrupts import held_interrupts
 
 _log = logging.getLogger(__name__)
 
@@ -44,9 +45,10 @@ def mitsuba_variant() -> Iterator[ModuleType]:
         raise InputError(
             "tungsten-dip was built without its Mitsuba plugins; install mitsuba, then build it again"
         )
-    mitsuba = importlib.import_module("mitsuba")
-    previous_variant = mitsuba.variant()
-    mitsuba.set_variant(VARIANT)
+    with held_interrupts():
+        mitsuba = importlib.import_module("mitsuba")
+        previous_variant = mitsuba.variant()
+        mitsuba.set_variant(VARIANT)
     resolver = mitsuba.file_resolver()
     if str(_PLUGIN_PARENT) not in [str(path) for path in resolver]:
         resolver.append(str(_PLUGIN_PARENT))

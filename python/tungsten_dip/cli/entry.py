@@ -1,0 +1,40 @@
+"""Where the commands begin: Ctrl-C ends a process that is still loading its libraries with one line.
+
+Python would raise it in the midst of an import, which libraries answer with tracebacks or a crash.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_INTERRUPTED = 130
+
+
+def tungsten() -> int:
+    """Run ``tungsten``."""
+    with _leaving_on_interrupt("tungsten"):
+        from tungsten_dip.cli.tungsten import main
+    return main()
+
+
+def tungsten_dip() -> int:
+    """Run ``tungsten-dip``."""
+    with _leaving_on_interrupt("tungsten-dip"):
+        from tungsten_dip.cli.tungsten_dip import main
+    return main()
+
+
+@contextmanager
+def _leaving_on_interrupt(command: str) -> Iterator[None]:
+    def leave(number: int, frame: object) -> None:
+        os.write(2, f"{command}: interrupted\n".encode())
+        os._exit(_INTERRUPTED)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as of a process in the background
+        signal.signal(signal.SIGINT, leave)
+    yield
+    signal.signal(signal.SIGINT, before)
