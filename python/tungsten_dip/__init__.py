@@ -12,6 +12,8 @@ The public names are all here and load on first use: importing the package loads
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tungsten_dip.interrupts import held_interrupts
+
 if TYPE_CHECKING:
     from tungsten_dip.buffers.image_file import read_image, write_image
     from tungsten_dip.buffers.model import Buffer, RenderBuffers
@@ -79,7 +81,9 @@ def __getattr__(name: str) -> Any:
         return import_module("importlib.metadata").version("tungsten-dip")
     if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE_BY_NAME[name]}"), name)
+    with held_interrupts():
+        module = import_module(f"{__name__}.{_MODULE_BY_NAME[name]}")
+    return getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -18,6 +18,8 @@ from tqdm import tqdm
 
 from tungsten_dip.errors import InputError
 
+tqdm.get_lock()  # made on first use otherwise, which Ctrl-C must not cut short
+
 EXIT_INTERNAL, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 DEBUG_VARIABLE = "TUNGSTEN_DIP_DEBUG"

@@ -13,6 +13,7 @@ from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
+from tungsten_dip.interrupts import held_interrupts
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -56,7 +57,8 @@ def load_warm_start(options: argparse.Namespace) -> Model | None:
     """Return the model that the fit is to start from, if any."""
     if options.warm_start is None:
         return None
-    from tungsten_dip.onnx import load_model  # imports ONNX
+    with held_interrupts():
+        from tungsten_dip.onnx import load_model  # imports ONNX
 
     return load_model(options.warm_start)
 

@@ -21,6 +21,7 @@ from tungsten_dip.cli.denoising import (
     load_warm_start,
 )
 from tungsten_dip.errors import InputError
+from tungsten_dip.interrupts import held_interrupts
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -62,10 +63,11 @@ _REFIT_HELP = (
 
 
 def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from tungsten_dip.sequence.cluster import denoise_on_cluster
-    from tungsten_dip.sequence.following import Models
-    from tungsten_dip.sequence.frames import find_frames, numbers_from_text
-    from tungsten_dip.sequence.work import Run, denoise_frames
+    with held_interrupts():
+        from tungsten_dip.sequence.cluster import denoise_on_cluster
+        from tungsten_dip.sequence.following import Models
+        from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+        from tungsten_dip.sequence.work import Run, denoise_frames
 
     if options.workers < 1:
         raise InputError(f"--workers: expected 1 or more, got {options.workers}")

@@ -28,6 +28,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, require_torch
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
+from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
@@ -114,7 +115,8 @@ def _run(arguments: Sequence[str] | None) -> None:
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     follower = None
     if options.dip_denoise and len(options.scenes) > 1 and settings.preset != "paper":
-        from tungsten_dip.sequence.following import Follower, Models
+        with held_interrupts():
+            from tungsten_dip.sequence.following import Follower, Models
 
         follower = Follower(settings, models=Models(first=warm_start))
     failed = 0

@@ -86,7 +86,8 @@ def denoise(
 
         result = fit_paper(buffers, settings, progress, warm_start)
     else:
-        from tungsten_dip.fit.fusion import fit_fusion
+        with held_interrupts():
+            from tungsten_dip.fit.fusion import fit_fusion
 
         result = fit_fusion(buffers, settings, progress, given, warm_start, previous)
     result = replace(result, notes=(*mended, *result.notes))

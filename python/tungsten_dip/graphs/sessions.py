@@ -8,12 +8,10 @@ from typing import Any, Literal
 import onnx
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.interrupts import held_interrupts
 
 # Read as it is imported: otherwise onnxruntime keeps a device id, and sends what it is used for to Microsoft.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-with held_interrupts():
-    import onnxruntime as ort
+import onnxruntime as ort
 
 Device = Literal["auto", "cpu", "cuda"]
 
