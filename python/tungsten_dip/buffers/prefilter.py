@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FEATURES, Buffer, RenderBuffers
+from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 0.35), (5, 0.5), (5, 0.7))
@@ -19,15 +19,17 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
 
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
     Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it.
-    Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit, and
-    so do features without halves. Normals are not normalised again. Expects sanitised buffers. ``threads``
-    None uses every core.
+    Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A
+    feature without halves is filtered with weights of its own, by the noise that its second differences
+    tell. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
         feature: Buffer | None = getattr(buffers, name)
-        if feature is not None and feature.halves is not None:
-            mean, (half_a, half_b), variance = feature.mean, feature.halves, feature.variance
+        if feature is not None:
+            mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
+            if feature.halves is None:
+                variance = _noise_in(mean, thread_count(threads))
             for radius, k in _PASSES:
                 mean, half_a, half_b, variance = _core.prefilter_feature(
                     mean, half_a, half_b, variance, radius=radius, k=k, threads=thread_count(threads)
@@ -36,4 +38,21 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
                 # Where negative values were mended, the mean is not that of the halves, and may fall below 0.
                 np.maximum(mean, 0, out=mean)
             filtered[name] = Buffer(mean, half_a, half_b, variance)
+            if feature.halves is None:
+                filtered[name] = Buffer(mean, variance=variance)
     return buffers.with_quantities(**filtered)
+
+
+def _noise_in(image: FloatImage, threads: int) -> FloatImage:
+    """Return the variance of an image's noise, told by itself; the mean over the 5x5 pixels around.
+
+    Immerkaer's stencil (1996, "Fast Noise Variance Estimation") leaves of an image what is neither constant
+    nor linear in either direction: noise, and edges.
+    """
+    if image.size == 0:
+        return image
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    down = padded[:-2] - 2 * padded[1:-1] + padded[2:]
+    across = down[:, :-2] - 2 * down[:, 1:-1] + down[:, 2:]
+    noise: FloatImage = _core.box_mean(np.ascontiguousarray((across / np.float32(6)) ** 2), 2, threads)
+    return noise

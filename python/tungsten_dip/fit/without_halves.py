@@ -21,8 +21,20 @@ from tungsten_dip.fit.pilots import Pilot, PilotMaker, first_guides, guidance_of
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
-_ONLY_PILOT = Pilot(9, k=1.0)
-"""Used alone where nothing can score the pilots."""
+_PILOTS = (
+    Pilot(9, k=1.0),
+    Pilot(10, k=2.0, step=2, with_position=True),
+    Pilot(4, k=1.0, by_color=True),
+)
+"""Of these the image is made where nothing can score them. The last, of the colour alone, keeps what no
+feature shows, and outliers."""
+
+_SHARES = (0.4, 0.4, 0.2)
+"""Of the pilots in the image."""
+
+_OUTLIER = 4.0
+_OUTLIER_OFFSET = 0.02
+"""Brighter than so many times the first pilot and this much more, the last one shows an outlier."""
 
 _UNEQUAL = 0.5
 """Halves of one and two samples are so far apart from the mean of all three, in units of half their
@@ -40,9 +52,9 @@ def result_without_halves(
 ) -> FitResult | None:
     """Return what is made of sanitised buffers whose halves tell nothing, None where they do.
 
-    That is what one pilot makes of all samples or, if the settings ask for it, Open Image Denoise; an image
-    without noise comes back as it is. ``started`` is a value of time.perf_counter; ``offered``: there are
-    candidates, of which a note says that they are not used.
+    That is a mean of what three pilots make of all samples or, if the settings ask for it, Open Image
+    Denoise; an image without noise comes back as it is. ``started`` is a value of time.perf_counter;
+    ``offered``: there are candidates, of which a note says that they are not used.
     """
     color = buffers.color
     scale = exposure(color.mean)
@@ -64,8 +76,16 @@ def result_without_halves(
             guidance = guidance_of_halves(buffers, colors, scale, thread_count(settings.threads))
             progress(0.2, "features")
             guides = first_guides(colors, variance, guidance)
-            (image,) = PilotMaker(colors, variance, guidance, guides).images(_ONLY_PILOT)
-            image, message = unscaled(image, scale), "one pilot"
+            maker = PilotMaker(colors, variance, guidance, guides)
+            # In images as small as a window of them, the others say nothing of their own.
+            small = max(buffers.width, buffers.height) <= 2 * _PILOTS[1].radius
+            first, *others = (maker.images(pilot)[0] for pilot in _PILOTS[: 1 if small else None])
+            image, message = first, "one pilot"
+            if others:
+                others[-1] = np.minimum(others[-1], _OUTLIER * first + np.float32(_OUTLIER_OFFSET))
+                image = np.tensordot(np.array(_SHARES, np.float32), np.stack((first, *others)), 1)
+                message = "three pilots"
+            image = unscaled(image, scale)
     seconds = time.perf_counter() - started
     progress(1.0, message)
     history = (HistoryPoint(seconds, 0, None),)
@@ -92,7 +112,7 @@ def _halves_belong(color: Buffer) -> bool:
 
 
 def _why_no_halves(buffers: RenderBuffers, test: HalvesTest, pilot: str) -> str:
-    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "one pilot is used"
+    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "three pilots are averaged"
     tail = f"nothing can score the result: {used}, without an estimate of its error"
     if buffers.color.halves is None:
         return f"no half buffers: {tail}"
