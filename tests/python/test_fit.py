@@ -180,6 +180,16 @@ def test_without_halves_there_is_no_estimate(variance: bool, render: SyntheticRe
     assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 8
 
 
+def test_without_halves_fireflies_are_limited_and_lamps_are_not(render: SyntheticRender) -> None:
+    color, albedo = render.buffers.color.mean.copy(), np.full_like(render.buffers.color.mean, 0.5)
+    color[10, 10] = 1e4
+    color[30, 30] = albedo[30, 30] = 1e3  # one pixel, but in plain view
+    result = denoise(RenderBuffers(Buffer(color), albedo=Buffer(albedo)), _settings())
+    assert any("1 firefly limited" in note for note in result.notes)
+    assert result.color[8:13, 8:13].max() < 100
+    assert result.color[28:33, 28:33].sum() > 0.5 * color[30, 30].sum()
+
+
 def test_copied_halves_score_nothing(render: SyntheticRender) -> None:
     mean = render.buffers.color.mean
     buffers = render.buffers.with_quantities(

@@ -31,25 +31,49 @@ def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tup
     times the mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if
     anything.
     """
-    levels = [half.mean(axis=2, keepdims=True, dtype=np.float64) for half in (half_a, half_b)]
+    levels = [_level(half) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)
-    limited, taken, pixels = [], 0.0, 0
-    for half, level, other in zip((half_a, half_b), levels, levels[::-1], strict=True):
-        limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other)
-        over = level > limit
-        factor = np.where(over, limit / np.where(over, level, 1), 1)
-        limited.append(half * factor.astype(np.float32))
-        pixels += int(over.sum())
-        taken += float((level - level * factor).sum())
-    if pixels == 0:
-        return (half_a, half_b), None
-    total = float(levels[0].sum() + levels[1].sum())
-    noun = "firefly" if pixels == 1 else "fireflies"
-    note = f"{pixels} {noun} limited, with {100 * taken / total:.3g}% of the image's energy"
-    return (limited[0], limited[1]), note
+    limits = [np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other) for other in levels[::-1]]
+    (a, taken_a), (b, taken_b) = (
+        _limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True)
+    )
+    return (a, b), _note(np.concatenate((taken_a, taken_b)), float(levels[0].sum() + levels[1].sum()))
 
 
-def _surroundings(level: np.ndarray[tuple[int, ...], np.dtype[np.float64]], threads: int) -> FloatImage:
+def limit_fireflies_alone(color: FloatImage, threads: int) -> tuple[FloatImage, str | None]:
+    """Scale down pixels of all samples that their surroundings do not support, as `limit_fireflies` does.
+
+    Nothing else tells whether they are there: what is emitted in plain view does not belong in ``color``.
+    """
+    level = _level(color)
+    limited, taken = _limited(color, level, _LIMIT * _surroundings(level, threads).astype(np.float64))
+    return limited, _note(taken, float(level.sum()))
+
+
+_Levels = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+
+
+def _level(image: FloatImage) -> _Levels:
+    level: _Levels = image.mean(axis=2, keepdims=True, dtype=np.float64)
+    return level
+
+
+def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> tuple[FloatImage, _Levels]:
+    """Return the image, no brighter than the limit, and what every pixel that was brighter has lost."""
+    over = level > limit
+    factor = np.where(over, limit / np.where(over, level, 1), 1)
+    limited: FloatImage = image * factor.astype(np.float32)
+    return limited, (level - limit)[over]
+
+
+def _note(taken: _Levels, total: float) -> str | None:
+    if taken.size == 0:
+        return None
+    noun = "firefly" if taken.size == 1 else "fireflies"
+    return f"{taken.size} {noun} limited, with {100 * taken.sum() / total:.3g}% of the image's energy"
+
+
+def _surroundings(level: _Levels, threads: int) -> FloatImage:
     """Return the mean around every pixel, to which no other pixel adds more than `_LIMIT` times its own."""
     capped = np.minimum(level, _BRIGHTEST).astype(np.float32)
     for _ in range(_ROUNDS):

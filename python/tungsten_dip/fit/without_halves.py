@@ -17,6 +17,7 @@ from tungsten_dip.fit.evidence import (
     scaled_variance,
     unscaled,
 )
+from tungsten_dip.fit.fireflies import limit_fireflies_alone
 from tungsten_dip.fit.pilots import Pilot, PilotMaker, first_guides, guidance_of_halves
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
@@ -72,8 +73,16 @@ def result_without_halves(
             image, message = oidn_mean(buffers, color.mean, settings.threads), "Open Image Denoise"
         else:
             notes = [*notes_on_features(buffers), *notes]
-            colors, variance = (scaled(color.mean, scale),), scaled_variance(color, scale)
-            guidance = guidance_of_halves(buffers, colors, scale, thread_count(settings.threads))
+            threads = thread_count(settings.threads)
+            emitted = np.zeros_like(color.mean)
+            if buffers.albedo is not None:
+                emitted = np.clip(buffers.albedo.mean - 1, 0, color.mean)
+            rest, fireflies = limit_fireflies_alone(scaled(color.mean - emitted, scale), threads)
+            if fireflies is not None:
+                notes.append(fireflies)
+            colors = (rest + scaled(emitted, scale),)
+            variance = scaled_variance(color, scale)
+            guidance = guidance_of_halves(buffers, colors, scale, threads)
             progress(0.2, "features")
             guides = first_guides(colors, variance, guidance)
             maker = PilotMaker(colors, variance, guidance, guides)
