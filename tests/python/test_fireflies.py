@@ -101,6 +101,9 @@ def test_alone_what_the_surroundings_do_not_support_is_limited() -> None:
     np.testing.assert_array_equal(limited[others], color[others])
     assert 0.5 < limited[20, 20].mean() <= 15
     np.testing.assert_allclose(limited[20, 20, 0], 2 * limited[20, 20, 1], rtol=1e-5)
-    black, note = limit_fireflies_alone(np.zeros((1, 1, 3), np.float32), 1)
-    assert note is None
-    assert not black.any()
+    for size in (1, 9):
+        dark = np.zeros((size, size, 3), np.float32)
+        dark[size // 2, size // 2] = 0.5
+        same, note = limit_fireflies_alone(dark, 1)
+        assert note is None
+        np.testing.assert_array_equal(same, dark)

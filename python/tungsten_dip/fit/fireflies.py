@@ -14,6 +14,9 @@ _LIMIT = 15.0
 _LIMIT_OF_OTHER = 4.0
 """How many times brighter than in the other half: what is there at all, both halves show about alike."""
 
+_DARK = 0.05
+"""Surroundings that are darker support as much: a lit pixel alone on black is no firefly."""
+
 _ROUNDS = 100
 """Enough for a cluster of 3x3 pixels, which every round lowers to 0.4 of itself, from 1e30 to 1e-10."""
 
@@ -43,10 +46,12 @@ def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tup
 def limit_fireflies_alone(color: FloatImage, threads: int) -> tuple[FloatImage, str | None]:
     """Scale down pixels of all samples that their surroundings do not support, as `limit_fireflies` does.
 
-    Nothing else tells whether they are there: what is emitted in plain view does not belong in ``color``.
+    Nothing else tells whether they are there: what is emitted in plain view does not belong in ``color``. Its
+    lit pixels have a median of about 0.25.
     """
     level = _level(color)
-    limited, taken = _limited(color, level, _LIMIT * _surroundings(level, threads).astype(np.float64))
+    around = np.maximum(_surroundings(level, threads), _DARK).astype(np.float64)
+    limited, taken = _limited(color, level, _LIMIT * around)
     return limited, _note(taken, float(level.sum()))
 
 
