@@ -18,7 +18,7 @@ import numpy as np
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
 from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
-from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
+from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Part, Source
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file
 
@@ -187,11 +187,15 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     main, _ = owner[groups["color"][0]]
     planes: dict[str, FloatImage] = {}
     for key, names in groups.items():
-        for part, _ in (owner[name] for name in names):
+        channels = []
+        for part, name in (owner[name] for name in names):
             if part.window != main.window:
                 raise InputError(_sizes_differ(f"{path}: {key}", part, main))
-        stacked = np.stack([owner[name][1].astype(np.float32) for name in names], axis=-1)
+            channels.append(part.channels[name])
+        stacked = np.stack([channel.astype(np.float32) for channel in channels], axis=-1)
         planes[key] = _with_channel_count(stacked, path, key, names)
+        if planes[key] is stacked:
+            _share(stacked, [owner[name] for name in names])
     spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
     spp = float(spp) if isinstance(spp, (int, float)) and spp > 0 else None
     if "colorVariance" not in source.mapping:
@@ -217,14 +221,21 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     )
 
 
-def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, Channel]]:
-    """Every channel by a name that is unique in the file: of several parts, each is a layer."""
+def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, str]]:
+    """The part and name of every channel by a name unique in the file: of several parts, each is a layer."""
     names = {}
     for part in parts:
-        for name, channel in part.channels.items():
-            prefix = f"{part.name}." if len(parts) > 1 else ""
-            names[name if name.startswith(prefix) else prefix + name] = (part, channel)
+        prefix = f"{part.name}." if len(parts) > 1 else ""
+        for name in part.channels:
+            names[name if name.startswith(prefix) else prefix + name] = (part, name)
     return names
+
+
+def _share(stacked: FloatImage, sources: list[tuple[Part, str]]) -> None:
+    """Let channels that were read be views of the image made of them: at 4K that saves more than a GiB."""
+    for index, (part, name) in enumerate(sources):
+        if part.channels[name].dtype == np.float32:
+            part.channels[name] = stacked[..., index]
 
 
 def _with_channel_count(image: FloatImage, path: Path, key: str, names: tuple[str, ...]) -> FloatImage:
@@ -250,7 +261,7 @@ def _settle_variance(
     if not groups.get("colorVariance", ("",))[0].lower().startswith("variance."):
         return
     if spp:
-        planes["colorVariance"] /= np.float32(spp)
+        planes["colorVariance"] = planes["colorVariance"] / np.float32(spp)
         log.info("Variance: of one sample, divided by %g samples per pixel", spp)
     else:
         del planes["colorVariance"]
