@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,6 +14,7 @@ from tungsten_dip.bench.results import Key, Measurement, Results
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.buffers import FloatImage, read_image, replacing, write_image
 from tungsten_dip.errors import InputError
+from tungsten_dip.interrupts import heeded_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.report.metrics import compare
 
@@ -68,7 +66,7 @@ class Runner:
                 progress((done + fraction) / len(tasks), f"{what}: {message}")
 
             part(0, task.bench_set.name)
-            with heeding_interrupts():
+            with heeded_interrupts():
                 outcomes = task.method.run(task.repeat, part)
             if task.repeat == 0:
                 for outcome in outcomes:
@@ -107,25 +105,3 @@ class Runner:
         # Names alone do not tell sets apart: a folder may hold the measurements of several of one name.
         name = re.sub(r"[^a-z0-9]+", "-", f"{bench_set.name} {bench_set.digest[:8]} {label}".lower())
         return self._folder / "images" / f"{name}.exr"
-
-
-@contextmanager
-def heeding_interrupts() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the end if one came, for a fit ends early on it with what it has."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    pressed = False
-
-    def note(number: int, frame: object) -> None:
-        nonlocal pressed
-        pressed = True
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
