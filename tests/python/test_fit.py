@@ -426,7 +426,7 @@ def test_progress_never_falls_and_ends_at_one(render: SyntheticRender) -> None:
     without_halves = RenderBuffers(Buffer(render.buffers.color.mean))
     for buffers, target in ((render.buffers, None), (render.buffers, 10.0), (without_halves, None)):
         told: list[float] = []
-        denoise(buffers, _settings(target_error=target), lambda fraction, _, told=told: told.append(fraction))  # type: ignore[misc]
+        denoise(buffers, _settings(target_error=target), lambda fraction, _, told=told: told.append(fraction))
         assert told == sorted(told)
         assert told[-1] == 1
 

@@ -74,7 +74,7 @@ def test_tungsten_reads_the_scene_itself(tmp_path: Path, monkeypatch: pytest.Mon
     path.write_text('{"primitives": [{"type": "mesh", "file": "of a fork.abc"}]}')
     monkeypatch.setattr(tungsten, "available", lambda: True)
     monkeypatch.setattr(tungsten, "render", lambda path, **_: path)
-    assert hosts.render(path) == path  # type: ignore[comparison-overlap]
+    assert hosts.render(path) == path
     with pytest.raises(InputError, match="expected a file"):
         hosts.render(path, host="mitsuba")
 

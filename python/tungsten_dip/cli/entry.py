@@ -10,7 +10,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_INTERRUPTED = 130
+_INTERRUPTED = 130  # `console.EXIT_INTERRUPTED`, without the libraries that importing it loads
 
 
 def tungsten() -> int:

@@ -121,7 +121,7 @@ def _halves_belong(color: Buffer) -> bool:
 
 
 def _why_no_halves(buffers: RenderBuffers, test: HalvesTest, pilot: str) -> str:
-    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "three pilots are averaged"
+    used = "the image is that of Open Image Denoise" if pilot == "oidn" else "a mean of pilots is used"
     tail = f"nothing can score the result: {used}, without an estimate of its error"
     if buffers.color.halves is None:
         return f"no half buffers: {tail}"
