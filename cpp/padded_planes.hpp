@@ -32,16 +32,29 @@ class PaddedPlanes {
 
     PaddedPlanes(ConstImage image, int margin, int threads)
         : PaddedPlanes(image.channels, image.height, image.width, margin) {
-        parallel_for(height_ + 2 * margin, threads, [&](int i) {
-            const int y = i - margin;
-            const int from_y = std::clamp(y, 0, height_ - 1);
+        parallel_for(height_, threads, [&](int y) {
             for (int c = 0; c < channels_; ++c) {
                 float* to = row(c, y);
-                for (int x = -margin; x < width_ + margin; ++x) {
-                    to[x] = image.at(from_y, std::clamp(x, 0, width_ - 1), c);
-                }
+                for (int x = 0; x < width_; ++x) to[x] = image.at(y, x, c);
             }
         });
+        repeat_border();
+    }
+
+    // Copies the border of what is inside into the margin.
+    void repeat_border() {
+        const auto columns = static_cast<std::size_t>(stride_);
+        for (int c = 0; c < channels_; ++c) {
+            for (int y = 0; y < height_; ++y) {
+                float* pixels = row(c, y);
+                std::fill_n(pixels - margin_, margin_, pixels[0]);
+                std::fill_n(pixels + width_, margin_, pixels[width_ - 1]);
+            }
+            for (int i = 1; i <= margin_; ++i) {
+                std::copy_n(row(c, 0) - margin_, columns, row(c, -i) - margin_);
+                std::copy_n(row(c, height_ - 1) - margin_, columns, row(c, height_ - 1 + i) - margin_);
+            }
+        }
     }
 
     [[nodiscard]] int channels() const { return channels_; }

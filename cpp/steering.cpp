@@ -3,6 +3,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <stdexcept>
 #include <vector>
 
@@ -56,25 +57,30 @@ Kernel<radius> gaussian_derivative(float sigma) {
     return kernel;
 }
 
-// out = in, convolved with one kernel along rows and with another along columns.
+TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, const float* values, int count, float* sums) {
+    for (int x = 0; x < count; ++x) sums[x] += weights[x] * values[x];
+}
+
+TUNGSTEN_DIP_FASTEST void add_scaled(const float* values, float scale, std::size_t count, float* sums) {
+    for (std::size_t x = 0; x < count; ++x) sums[x] += scale * values[x];
+}
+
+// A row of a channel, convolved along columns; `radius` pixels more at both ends.
 template <int radius>
-void convolve(const PaddedPlanes& in, int channel, const Kernel<radius>& along_rows,
-              const Kernel<radius>& along_columns, int threads, std::vector<float>& out) {
-    const auto width = static_cast<std::size_t>(in.width());
-    out.resize(static_cast<std::size_t>(in.height()) * width);
-    parallel_for(in.height(), threads, [&](int y) {
-        std::vector<float> columns(width + 2 * std::size_t{radius}, 0.0F);
-        int from = y - radius;
-        for (const float weight : along_columns) {
-            const float* row = in.row(channel, from++) - radius;
-            for (std::size_t x = 0; x < columns.size(); ++x) columns[x] += weight * row[x];
-        }
-        float* to = out.data() + static_cast<std::size_t>(y) * width;
-        std::fill_n(to, width, 0.0F);
-        for (std::size_t dx = 0; dx < along_rows.size(); ++dx) {
-            for (std::size_t x = 0; x < width; ++x) to[x] += along_rows[dx] * columns[x + dx];
-        }
-    });
+void convolve_columns(const PaddedPlanes& in, int channel, int y, const Kernel<radius>& kernel,
+                      std::vector<float>& out) {
+    out.assign(static_cast<std::size_t>(in.width()) + 2 * std::size_t{radius}, 0);
+    int from = y - radius;
+    for (const float weight : kernel)
+        add_scaled(in.row(channel, from++) - radius, weight, out.size(), out.data());
+}
+
+// out = what `convolve_columns` gives, convolved along the row.
+template <int radius>
+void convolve_row(const std::vector<float>& in, const Kernel<radius>& kernel, std::vector<float>& out) {
+    out.assign(in.size() - 2 * std::size_t{radius}, 0);
+    const float* from = in.data();
+    for (const float weight : kernel) add_scaled(from++, weight, out.size(), out.data());
 }
 
 // The products of the features' gradients, summed over features and smoothed: channels xx, yy, xy (Foerstner
@@ -83,32 +89,35 @@ PaddedPlanes structure_tensor(ConstImage features, int edge, int threads) {
     const PaddedPlanes planes(features, derivative_radius, threads);
     const auto smooth = gaussian<derivative_radius>(derivative_sigma);
     const auto derivative = gaussian_derivative<derivative_radius>(derivative_sigma);
-    std::vector<float> products(static_cast<std::size_t>(features.height) *
-                                static_cast<std::size_t>(features.width) * 3);
-    std::vector<float> dx;
-    std::vector<float> dy;
-    for (int c = 0; c < features.channels; ++c) {
-        convolve<derivative_radius>(planes, c, derivative, smooth, threads, dx);
-        convolve<derivative_radius>(planes, c, smooth, derivative, threads, dy);
-        for (std::size_t i = 0; i < dx.size(); ++i) {
-            products[3 * i] += dx[i] * dx[i];
-            products[3 * i + 1] += dy[i] * dy[i];
-            products[3 * i + 2] += dx[i] * dy[i];
+    PaddedPlanes products(3, features.height, features.width, tensor_radius);
+    parallel_for(features.height, threads, [&](int y) {
+        std::vector<float> columns;
+        std::vector<float> dx;
+        std::vector<float> dy;
+        for (int c = 0; c < features.channels; ++c) {
+            convolve_columns<derivative_radius>(planes, c, y, smooth, columns);
+            convolve_row<derivative_radius>(columns, derivative, dx);
+            convolve_columns<derivative_radius>(planes, c, y, derivative, columns);
+            convolve_row<derivative_radius>(columns, smooth, dy);
+            add_weighted(dx.data(), dx.data(), features.width, products.row(0, y));
+            add_weighted(dy.data(), dy.data(), features.width, products.row(1, y));
+            add_weighted(dx.data(), dy.data(), features.width, products.row(2, y));
         }
-    }
-    const ConstImage image{
-        .data = products.data(), .height = features.height, .width = features.width, .channels = 3};
-    const PaddedPlanes padded(image, tensor_radius, threads);
+    });
+    products.repeat_border();
     const auto window = gaussian<tensor_radius>(tensor_sigma);
-    std::vector<float> tensor(products.size());
-    std::vector<float> smoothed;
-    for (std::size_t c = 0; c < 3; ++c) {
-        convolve<tensor_radius>(padded, static_cast<int>(c), window, window, threads, smoothed);
-        for (std::size_t i = 0; i < smoothed.size(); ++i) tensor[3 * i + c] = smoothed[i];
-    }
-    const ConstImage joined{
-        .data = tensor.data(), .height = features.height, .width = features.width, .channels = 3};
-    return {joined, edge, threads};
+    PaddedPlanes tensor(3, features.height, features.width, edge);
+    parallel_for(features.height, threads, [&](int y) {
+        std::vector<float> columns;
+        std::vector<float> smoothed;
+        for (int c = 0; c < 3; ++c) {
+            convolve_columns<tensor_radius>(products, c, y, window, columns);
+            convolve_row<tensor_radius>(columns, window, smoothed);
+            std::copy(smoothed.begin(), smoothed.end(), tensor.row(c, y));
+        }
+    });
+    tensor.repeat_border();
+    return tensor;
 }
 
 struct TensorRow {
@@ -177,21 +186,46 @@ TUNGSTEN_DIP_FASTEST void weigh_offset(const Gaussians& gaussians, const TensorR
     }
 }
 
-TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, const float* values, int count, float* sums) {
-    for (int x = 0; x < count; ++x) sums[x] += weights[x] * values[x];
-}
-
-// Whether no pixel up to `radius` around a block holds anything, as is so of emitted light in most places.
-bool empty_around(const PaddedPlanes& planes, int y, int first, int count, int radius) {
-    for (int c = 0; c < planes.channels(); ++c) {
-        for (int row = y - radius; row <= y + radius; ++row) {
-            const float* values = planes.row(c, row) + first;
-            if (!std::all_of(values - radius, values + count + radius, [](float v) { return v == 0; }))
-                return false;
-        }
+// Which blocks of columns hold anything up to `radius` pixels around: emitted light is 0 in most places.
+class LitBlocks {
+  public:
+    LitBlocks(const PaddedPlanes& planes, int radius, int threads)
+        : height_(planes.height()),
+          blocks_((planes.width() + block_width - 1) / block_width),
+          radius_(radius),
+          lit_(static_cast<std::size_t>(height_) * static_cast<std::size_t>(blocks_)) {
+        parallel_for(height_, threads, [&](int y) {
+            for (int block = 0; block < blocks_; ++block) {
+                const int first = block * block_width - radius;
+                const int end = std::min((block + 1) * block_width, planes.width()) + radius;
+                for (int c = 0; c < planes.channels(); ++c) {
+                    const float* row = planes.row(c, y);
+                    if (std::any_of(row + first, row + end, [](float value) { return value != 0; }))
+                        lit_[index(y, block)] = 1;
+                }
+            }
+        });
     }
-    return true;
-}
+
+    [[nodiscard]] bool around(int y, int block) const {
+        const int end = std::min(y + radius_ + 1, height_);
+        for (int row = std::max(y - radius_, 0); row < end; ++row) {
+            if (lit_[index(row, block)] != 0) return true;
+        }
+        return false;
+    }
+
+  private:
+    int height_;
+    int blocks_;
+    int radius_;
+    std::vector<std::uint8_t> lit_;
+
+    [[nodiscard]] std::size_t index(int y, int block) const {
+        return static_cast<std::size_t>(y) * static_cast<std::size_t>(blocks_) +
+               static_cast<std::size_t>(block);
+    }
+};
 
 }  // namespace
 
@@ -202,6 +236,7 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
     const PaddedPlanes tensor = structure_tensor(features, radius, threads);
     const PaddedPlanes planes(image, radius, threads);
+    const LitBlocks lit(planes, radius, threads);
     const auto smooth_block = [&](int y, int first, int count) {
         const TensorRow here(tensor, y, first);
         const Gaussians gaussians(here, count, along, across);
@@ -231,10 +266,10 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
     parallel_for(image.height, threads, [&](int y) {
         for (int first = 0; first < image.width; first += block_width) {
             const int count = std::min(block_width, image.width - first);
-            if (empty_around(planes, y, first, count, radius)) {
-                std::fill_n(&out.at(y, first, 0), std::ptrdiff_t{count} * image.channels, 0.0F);
-            } else {
+            if (lit.around(y, first / block_width)) {
                 smooth_block(y, first, count);
+            } else {
+                std::fill_n(&out.at(y, first, 0), std::ptrdiff_t{count} * image.channels, 0.0F);
             }
         }
     });

@@ -275,6 +275,18 @@ def test_smoothing_along_edges_leaves_corners_and_constants() -> None:
         np.testing.assert_allclose(smooth, 2.5, rtol=1e-5)
 
 
+def test_smoothing_along_edges_of_a_light_alone() -> None:
+    features = np.random.default_rng(6).random((70, 110, 2), np.float32)
+    light = np.zeros((70, 110, 3), np.float32)
+    light[60:64, 2:5], light[20, 90] = 9, 5
+    # Where nothing is lit for far around, nothing is computed; on a pedestal all is.
+    alone, lifted = (
+        _core.smooth_along_edges(image, features, along=3, across=0.3) for image in (light, light + 1)
+    )
+    np.testing.assert_allclose(alone, lifted - 1, atol=1e-5)
+    assert alone[:, 40:70].max() == 0 < alone[60:64, 2:5].min()
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (0, 4)])
 def test_smoothing_along_edges_of_small_images(size: tuple[int, int]) -> None:
     image = np.random.default_rng(2).random((*size, 3), np.float32)
