@@ -10,6 +10,7 @@ import pytest
 from moving_camera import HEIGHT, WIDTH, true_frame
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
@@ -236,6 +237,20 @@ def test_frames_follow_and_gain_from_it(tmp_path):
         flicker(images[3], images[2], frames[3].reference, frames[2].reference) for images in (results, cold)
     )
     assert shown < 0.8 * shown_cold
+
+
+@pytest.mark.parametrize(
+    ("preset", "pilots"), [("draft", FOLLOWING_DRAFT_PILOTS), ("balanced", FOLLOWING_PILOTS)]
+)
+def test_followed_frames_have_few_pilots_of_their_own(tmp_path, preset, pilots):
+    follower = Follower(FitSettings(preset, seed=1))
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
+    assert follower.models.following.layout.pilots == pilots
+    assert follower.models.following.layout.candidates == 1
+    assert relmse(followed[1].result.color, frames[1].reference) < 0.3 * relmse(
+        frames[1].buffers.color.mean, frames[1].reference
+    )
 
 
 @pytest.mark.parametrize("refit", [0, 3])

@@ -181,13 +181,14 @@ def evidence_from_buffers(
         _check_fits(layout, guidance[0], len(candidates) + (previous is not None))
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
+    filled = None
     if previous is None:
         guides = first_guides(halves, variance, guidance)
     else:
         moved = scaled(previous[0], scale), scaled(previous[1], scale)
         guides, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
-    maker = PilotMaker(halves, variance, guidance, guides)
+    maker = PilotMaker(halves, variance, guidance, guides, filled)
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
@@ -202,7 +203,7 @@ def evidence_from_buffers(
     described = described[: len(images) - 1]
     for image_a, image_b in candidates:
         images.append((np.maximum(scaled(image_a, scale), 0), np.maximum(scaled(image_b, scale), 0)))
-    if previous is not None:
+    if filled is not None:
         images.append(filled)
 
     denominators = denominators_of(images[len(described)])

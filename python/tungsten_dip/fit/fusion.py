@@ -20,7 +20,14 @@ from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_sampl
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, check_settings, source_sha256
 from tungsten_dip.fit.outcome import result_from_fused
-from tungsten_dip.fit.pilots import BALANCED_PILOTS, DRAFT_PILOTS, FINAL_PILOTS, FOLLOWING_PILOTS, Pilot
+from tungsten_dip.fit.pilots import (
+    BALANCED_PILOTS,
+    DRAFT_PILOTS,
+    FINAL_PILOTS,
+    FOLLOWING_DRAFT_PILOTS,
+    FOLLOWING_PILOTS,
+    Pilot,
+)
 from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.training import start_of_training, train
@@ -42,10 +49,11 @@ class _Preset:
     pilots: tuple[Pilot, ...]
     steps: int
     batch_pixels: int = _BATCH_PIXELS
+    following: tuple[Pilot, ...] = FOLLOWING_PILOTS
 
 
 _PRESETS = {
-    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS),
+    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, FOLLOWING_DRAFT_PILOTS),
     "balanced": _Preset(BALANCED_PILOTS, 240),
     "final": _Preset(FINAL_PILOTS, 240),
 }
@@ -66,7 +74,7 @@ def fit_fusion(
     if warm_start is not None:
         check_settings(warm_start, settings)
     if previous is not None:
-        preset = _Preset(FOLLOWING_PILOTS, preset.steps)
+        preset = _Preset(preset.following, preset.steps)
     pilots = preset.pilots
     # One model of first order cannot stand for a whole image.
     largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)

@@ -102,14 +102,15 @@ FINAL_PILOTS = (
     Pilot(32, k=2.0, step=4, with_position=True),
 )
 
+FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES)
 FOLLOWING_PILOTS = (
-    Pilot(1),
-    EDGES,
+    *FOLLOWING_DRAFT_PILOTS,
     Pilot(4, k=1.0),
     Pilot(6, k=2.0, step=2),
     Pilot(4, k=1.0, by_color=True),
 )
-"""Enough beside what the previous frame shows. The first stands where that shows nothing."""
+"""Enough beside what the previous frame shows, as those of draft are for a look. The first stands where that
+shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -331,12 +332,16 @@ def following_guides(
 
 @dataclass
 class PilotMaker:
-    """Makes the pilots of both halves, or of the mean alone; ``variance`` as `first_guides` takes it."""
+    """Makes the pilots of both halves, or of the mean alone; ``variance`` as `first_guides` takes it.
+
+    ``previous``, what `following_guides` has filled, guides those that see the colour alone, if it is there.
+    """
 
     colors: tuple[FloatImage, ...]
     variance: FloatImage | None
     guidance: tuple[Guidance, ...]
     guides: Guides
+    previous: Halves | None = None
 
     def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
         """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
@@ -354,6 +359,8 @@ class PilotMaker:
     @cached_property
     def _by_color(self) -> tuple[tuple[Guidance, ...], Guides]:
         guidance = tuple(_without_features(g) for g in self.guidance)
+        if self.previous is not None:
+            return guidance, _guides(self.previous, self.colors, self.variance, guidance[0])
         return guidance, first_guides(self.colors, self.variance, guidance)
 
 

@@ -76,7 +76,8 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
 
     A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
     """
-    threads, layout = evidence.threads, evidence.layout
+    # The other half is at work beside this one.
+    threads, layout = max(evidence.threads // 2, 1), evidence.layout
     for name in layout.features:
         yield evidence.features[half][name]
     noise = evidence.noises[half]

@@ -115,7 +115,8 @@ def _fused(
     model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage]
 ) -> tuple[Halves, FloatImage | None]:
     """Return what the network makes of both halves, and of all samples if given, band by band of rows."""
-    session = session_from_proto(graph_of(model, metadata={}), evidence.threads)
+    # Both halves are computed side by side; the network is too small to share.
+    session = session_from_proto(graph_of(model, metadata={}), 1)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     rows_at_once = max(1, _RUN_PIXELS // width)
