@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers import FloatImage
-from tungsten_dip.fit.fireflies import limit_fireflies, limit_fireflies_alone
+from tungsten_dip.fit.fireflies import limit_fireflies
 
 
 def _halves(height: int = 24, width: int = 31) -> tuple[FloatImage, FloatImage]:
@@ -87,23 +87,3 @@ def test_limits_scale_with_the_exposure() -> None:
     scaled, _ = limit_fireflies(*(half * np.float32(2**-6) for half in halves), 1)
     for plain, small in zip(limit_fireflies(*halves, 1)[0], scaled, strict=True):
         np.testing.assert_array_equal(plain * np.float32(2**-6), small)
-
-
-def test_alone_what_the_surroundings_do_not_support_is_limited() -> None:
-    color = np.full((40, 40, 3), 0.5, np.float32)
-    color[20, 20] = (400, 200, 0)
-    color[5:11, 5:11] = 30  # a lamp: its own pixels support one another
-    limited, note = limit_fireflies_alone(color, 1)
-    assert note is not None
-    assert note.startswith("1 firefly limited")
-    others = np.ones((40, 40), bool)
-    others[20, 20] = False
-    np.testing.assert_array_equal(limited[others], color[others])
-    assert 0.5 < limited[20, 20].mean() <= 15
-    np.testing.assert_allclose(limited[20, 20, 0], 2 * limited[20, 20, 1], rtol=1e-5)
-    for size in (1, 9):
-        dark = np.zeros((size, size, 3), np.float32)
-        dark[size // 2, size // 2] = 0.5
-        same, note = limit_fireflies_alone(dark, 1)
-        assert note is None
-        np.testing.assert_array_equal(same, dark)

@@ -155,7 +155,7 @@ def test_color_alone(render: SyntheticRender) -> None:
     without_halves = RenderBuffers(Buffer(buffers.color.mean))
     result = denoise(without_halves, _settings())
     _check(result, without_halves)
-    assert result.estimated_relmse is None
+    assert _rel_mse(result.color, render.reference) < 1.2 * noisy  # every edge passes for noise
 
 
 @pytest.mark.parametrize("missing", ["albedo", "normal", "depth"])
@@ -167,38 +167,39 @@ def test_a_missing_feature_is_noted(missing: str, render: SyntheticRender) -> No
     assert not any(note.startswith("no ") for note in denoise(render.buffers, _settings(iterations=1)).notes)
 
 
-@pytest.mark.parametrize("variance", [True, False])
-def test_without_halves_there_is_no_estimate(variance: bool, render: SyntheticRender) -> None:
+def test_without_halves_the_noise_is_split(render: SyntheticRender) -> None:
     color = render.buffers.color
-    buffers = render.buffers.with_quantities(
-        color=Buffer(color.mean, variance=color.variance if variance else None)
-    )
+    buffers = render.buffers.with_quantities(color=Buffer(color.mean))
     result = denoise(buffers, _settings())
     _check(result, buffers)
-    assert result.estimated_relmse is None
-    assert any(note.startswith("no half buffers") for note in result.notes)
-    assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 8
+    assert result.model is not None
+    assert any("no half buffers: its noise" in note for note in result.notes)
+    error = _rel_mse(result.color, render.reference)
+    assert error < _rel_mse(color.mean, render.reference) / 8
+    assert result.estimated_relmse is not None
+    assert error / 4 < result.estimated_relmse < 4 * error
+    assert (denoise(buffers, _settings()).color == result.color).all()
 
 
 def test_without_halves_fireflies_are_limited_and_lamps_are_not(render: SyntheticRender) -> None:
     color, albedo = render.buffers.color.mean.copy(), np.full_like(render.buffers.color.mean, 0.5)
     color[10, 10] = 1e4
-    color[30, 30] = albedo[30, 30] = 1e3  # one pixel, but in plain view
+    color[29:32, 29:32] = albedo[29:32, 29:32] = 1e3  # in plain view
     result = denoise(RenderBuffers(Buffer(color), albedo=Buffer(albedo)), _settings())
-    assert any("1 firefly limited" in note for note in result.notes)
+    assert any(" limited, with " in note for note in result.notes)
     assert result.color[8:13, 8:13].max() < 100
-    assert result.color[28:33, 28:33].sum() > 0.5 * color[30, 30].sum()
+    assert result.color[27:34, 27:34].sum() > 0.5 * color[29:32, 29:32].sum()
 
 
-def test_copied_halves_score_nothing(render: SyntheticRender) -> None:
+def test_copied_halves_are_replaced(render: SyntheticRender) -> None:
     mean = render.buffers.color.mean
     buffers = render.buffers.with_quantities(
         color=Buffer(mean, mean, mean.copy(), render.buffers.color.variance)
     )
     result = denoise(buffers, _settings())
     _check(result, buffers)
-    assert result.estimated_relmse is None
     assert any("not independent" in note for note in result.notes)
+    assert _rel_mse(result.color, render.reference) < _rel_mse(mean, render.reference) / 8
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e12, 1e30])
@@ -267,7 +268,6 @@ def test_the_halves_of_the_result_are_what_its_mean_is_made_of(render: Synthetic
     assert result.halves is not None
     np.testing.assert_allclose((result.halves[0] + result.halves[1]) / 2, result.color, rtol=1e-6, atol=1e-7)
     assert (result.halves[0] != result.halves[1]).any()
-    assert denoise(RenderBuffers(Buffer(render.buffers.color.mean)), _settings()).halves is None
 
 
 def test_a_good_candidate_is_chosen(render: SyntheticRender) -> None:
@@ -503,8 +503,7 @@ def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None
         assert color.half_a is not None
         assert color.half_b is not None
         halves, guidance = (color.half_a, color.half_b), _guidance(buffers)
-        guides = first_guides(halves, None, guidance)
-        return PilotMaker(halves, None, guidance, guides).images(pilot)
+        return PilotMaker(halves, guidance, first_guides(halves, guidance)).images(pilot)
 
     features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
     noisy = render.buffers.with_quantities(**features)
@@ -652,7 +651,6 @@ def test_halves_of_another_picture_are_left_aside(spoil: str, render: SyntheticR
     result = denoise(buffers, _settings())
     _check(result, buffers)
     assert any("another picture" in note for note in result.notes)
-    assert result.estimated_relmse is None
     assert result.color.mean() == pytest.approx(color.mean.mean(), rel=0.05)
 
 

@@ -315,14 +315,16 @@ def test_a_frame_that_was_cut_short_is_no_cut(tmp_path):
     assert (followed.how, followed.result.interrupted) == ("followed", True)
 
 
-def test_frames_without_halves_are_denoised_each_by_itself(tmp_path):
-    frame = true_frame(tmp_path, 0.0, seed=0)
-    plain = RenderBuffers(Buffer(frame.buffers.color.mean), depth=frame.buffers.depth)
+def test_frames_without_halves_follow_too(tmp_path):
     follower = Follower(DRAFT)
-    for _ in range(2):
+    errors = []
+    for n in range(3):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        plain = RenderBuffers(Buffer(frame.buffers.color.mean), depth=frame.buffers.depth)
         followed = follower.denoise(plain, frame.camera)
-        assert (followed.how, followed.flicker) == ("fitted", None)
-        assert np.isfinite(followed.result.color).all()
+        assert (followed.how, followed.flicker) == ("followed" if n else "fitted", None)
+        errors.append(relmse(followed.result.color, frame.reference))
+    assert errors[2] < errors[0]
 
 
 def test_the_published_method_is_refused():

@@ -29,7 +29,7 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
         if feature is not None:
             mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
             if feature.halves is None:
-                variance = _noise_in(mean, thread_count(threads))
+                variance = noise_in(mean, thread_count(threads))
             for radius, k in _PASSES:
                 mean, half_a, half_b, variance = _core.prefilter_feature(
                     mean, half_a, half_b, variance, radius=radius, k=k, threads=thread_count(threads)
@@ -43,7 +43,7 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     return buffers.with_quantities(**filtered)
 
 
-def _noise_in(image: FloatImage, threads: int) -> FloatImage:
+def noise_in(image: FloatImage, threads: int) -> FloatImage:
     """Return the variance of an image's noise, told by itself; the mean over the 5x5 pixels around.
 
     Immerkaer's stencil (1996, "Fast Noise Variance Estimation") leaves of an image what is neither constant

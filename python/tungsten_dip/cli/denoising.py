@@ -81,10 +81,7 @@ def write_model(path: Path, result: FitResult) -> None:
     from tungsten_dip.onnx import save_model
 
     if result.model is None:
-        raise InputError(
-            f"{path}: not written: no network was fitted, for want of independent halves A and B of the "
-            f"colour; render with two_buffer_variance, without stratified_sampler"
-        )
+        raise InputError(f"{path}: not written: no network was fitted, as the image has no noise")
     save_model(path, result.model)
 
 

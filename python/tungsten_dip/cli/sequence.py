@@ -152,7 +152,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
         log.info("%s: left as it is: frame %d was finished before", path, first.number)
         return
     if models.first is None:
-        raise InputError(f"{path}: not written: no frame was fitted, for want of halves")
+        raise InputError(f"{path}: not written: no network was fitted, as the frames have no noise")
     save_model(path, models.first)
 
 

@@ -197,8 +197,7 @@ def _denoised(
     if options.error_map is not None:
         if result.error is None:
             raise InputError(
-                f"{options.error_map}: not written: the error is not known without independent halves of the "
-                "colour; render with two_buffer_variance, without stratified_sampler"
+                f"{options.error_map}: not written: the preset paper does not know its error; use another"
             )
         write_image(options.error_map, result.error)
 

@@ -49,8 +49,8 @@ def denoise(
     ``candidates`` are further guesses at the clean image, made by somebody else (another denoiser, say, or
     the previous frame moved into place): pairs of linear radiance in the shape of the colour, one image for
     half A of the samples and one for half B, neither of which may know anything of the other half. The
-    network chooses among them and its own. Without independent halves nothing can score them: they are not
-    used.
+    network chooses among them and its own. They are not used without independent halves, which are then drawn
+    from the image (`fit.splitting`).
 
     ``previous`` is what the halves of the previous frame's result show of this frame, moved into place, NaN
     where they show nothing. It is a candidate and a guide, beside which fewer pilots are needed.

@@ -149,7 +149,7 @@ def evidence_from_buffers(
 ) -> Evidence:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
-    The buffers have halves, and their noise is independent (`without_halves`).
+    The buffers have halves, and their noise is independent (`splitting`).
     ``pilots`` as a layout, of a network that exists, says all that it expects; all its pilots are computed.
     ``candidates`` are further pilots that somebody else computed, of linear radiance. ``previous`` is one
     more, NaN where it shows nothing, that guides the others as well. ``started`` is a value of
@@ -157,12 +157,11 @@ def evidence_from_buffers(
 
     Raises InputError if a layout names a feature that is missing or another number of candidates.
     """
-    notes = notes_on_features(buffers)
+    notes = _notes_on_features(buffers)
     scale = exposure(buffers.color.mean)
     color = buffers.color
     assert color.halves is not None
     half_a, half_b = color.halves
-    variance = scaled_variance(color, scale)
     threads = thread_count(settings.threads)
     layout = pilots if isinstance(pilots, Layout) else None
     described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
@@ -183,12 +182,12 @@ def evidence_from_buffers(
     computed: dict[Pilot, Halves] = {}
     filled = None
     if previous is None:
-        guides = first_guides(halves, variance, guidance)
+        guides = first_guides(halves, guidance)
     else:
         moved = scaled(previous[0], scale), scaled(previous[1], scale)
         guides, first, filled = following_guides(halves, moved, guidance)
         computed[FOLLOWING_PILOTS[0]] = first
-    maker = PilotMaker(halves, variance, guidance, guides, filled)
+    maker = PilotMaker(halves, guidance, guides, previous=filled)
     something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
@@ -236,9 +235,9 @@ def pilots_of_all_samples(
     guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.threads)
     a, b = evidence.halves
     variance = np.float32(0.25) * (a - b) ** 2
-    guides = first_guides(colors, variance, guidance)
+    guides = first_guides(colors, guidance, variance)
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
-    maker = PilotMaker(colors, variance, guidance, guides)
+    maker = PilotMaker(colors, guidance, guides, variance)
     something = _something(evidence.halves, buffers)
     pilots = evidence.layout.pilots
     computed = []
@@ -248,7 +247,7 @@ def pilots_of_all_samples(
         computed.append(maker.images(pilot)[0] * something)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        image = oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
+        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
         handed_in[-1] = scaled(image, evidence.scale)
     return (evidence.mean, *computed, *handed_in)
 
@@ -296,7 +295,7 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
 
 
-def oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
+def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
     """Return what Open Image Denoise makes of all samples, never negative."""
     albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
     return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
@@ -335,7 +334,7 @@ def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
     return something
 
 
-def notes_on_features(buffers: RenderBuffers) -> list[str]:
+def _notes_on_features(buffers: RenderBuffers) -> list[str]:
     """Return what there is to say of features that are missing."""
     missing = [name for name in FEATURES if getattr(buffers, name) is None]
     return [f"no {', '.join(missing)}: edges are found with less evidence"] if missing else []
@@ -346,11 +345,6 @@ def scaled(image: FloatImage, scale: float) -> FloatImage:
     brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
     bounded: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
     return bounded
-
-
-def scaled_variance(color: Buffer, scale: float) -> FloatImage | None:
-    """Return the variance of the colour in the units of the evidence, None if it is not known."""
-    return None if color.variance is None else scaled(scaled(color.variance, scale), scale)
 
 
 def unscaled(image: FloatImage, scale: float) -> FloatImage:

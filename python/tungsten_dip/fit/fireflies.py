@@ -14,9 +14,6 @@ _LIMIT = 15.0
 _LIMIT_OF_OTHER = 4.0
 """How many times brighter than in the other half: what is there at all, both halves show about alike."""
 
-_DARK = 0.05
-"""Surroundings that are darker support as much: a lit pixel alone on black is no firefly."""
-
 _ROUNDS = 100
 """Enough for a cluster of 3x3 pixels, which every round lowers to 0.4 of itself, from 1e30 to 1e-10."""
 
@@ -41,18 +38,6 @@ def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tup
         _limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True)
     )
     return (a, b), _note(np.concatenate((taken_a, taken_b)), float(levels[0].sum() + levels[1].sum()))
-
-
-def limit_fireflies_alone(color: FloatImage, threads: int) -> tuple[FloatImage, str | None]:
-    """Scale down pixels of all samples that their surroundings do not support, as `limit_fireflies` does.
-
-    Nothing else tells whether they are there: what is emitted in plain view does not belong in ``color``. Its
-    lit pixels have a median of about 0.25.
-    """
-    level = _level(color)
-    around = np.maximum(_surroundings(level, threads), _DARK).astype(np.float64)
-    limited, taken = _limited(color, level, _LIMIT * around)
-    return limited, _note(taken, float(level.sum()))
 
 
 _Levels = np.ndarray[tuple[int, ...], np.dtype[np.float64]]

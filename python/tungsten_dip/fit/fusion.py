@@ -19,7 +19,7 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, check_settings, source_sha256
-from tungsten_dip.fit.outcome import result_from_fused
+from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
@@ -30,8 +30,8 @@ from tungsten_dip.fit.pilots import (
 )
 from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.fit.training import start_of_training, train
-from tungsten_dip.fit.without_halves import result_without_halves
 from tungsten_dip.graphs.sessions import check_device
 from tungsten_dip.progress import Progress, silent
 
@@ -83,10 +83,13 @@ def fit_fusion(
         # Those of draft are enough by themselves where there is no time for others.
         pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
     asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
-    offered = bool(candidates) or previous is not None
-    alone = result_without_halves(buffers, settings, started, progress, offered=offered)
-    if alone is not None:
-        return alone
+    same = result_without_noise(buffers, settings, started)
+    if same is not None:
+        progress(1.0, "no noise")
+        return same
+    buffers, candidates, notes = with_independent_halves(
+        buffers, tuple(candidates), settings.seed, settings.threads
+    )
     evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     threads = evidence.threads
     start = start_of_training(evidence, settings.seed, warm_start)
@@ -136,7 +139,7 @@ def fit_fusion(
         started,
         training.steps_done,
         training.history,
-        training.notes,
+        [*notes, *training.notes],
     )
     model = Model(
         kind="pointwise",

@@ -10,9 +10,10 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
-from tungsten_dip.fit.evidence import Evidence, unscaled
+from tungsten_dip.fit.evidence import Evidence, exposure, unscaled
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 from tungsten_dip.fit.yielding import with_what_was_lost
 
@@ -29,6 +30,40 @@ _SURE = 0.35
 
 _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
+
+_CONVERGED = 1e-5
+"""relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
+
+
+def result_without_noise(buffers: RenderBuffers, settings: FitSettings, started: float) -> FitResult | None:
+    """Return the image as it is if its halves hardly differ, else None.
+
+    Copies do not differ at all: they tell something only if the variance, too, says that there is no noise.
+    ``started`` is a value of time.perf_counter.
+    """
+    color = buffers.color
+    if color.halves is None:
+        return None
+    a, b = color.halves
+    squared = color.mean.astype(np.float64) ** 2
+    noise = (a - b).astype(np.float64) ** 2 / 4
+    # Dark images are not taken for clean ones.
+    bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
+    told = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
+    if max(told) >= _CONVERGED or told == [0]:
+        return None
+    relative = np.minimum(noise / (squared + RELMSE_EPSILON), _LARGEST_ERROR)
+    error = channel_mean(relative.astype(np.float32))
+    return FitResult(
+        color=color.mean.copy(),
+        settings=settings,
+        seconds=time.perf_counter() - started,
+        iterations=0,
+        error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
+        estimated_relmse=float(error.mean(dtype=np.float64)),
+        halves=color.halves,
+        notes=("the halves agree to within a few thousandths: the image is returned as it is",),
+    )
 
 
 def estimate_error(

@@ -53,8 +53,8 @@ _STRAY_RADIUS = 2
 """Emission of one half so many times what the other half saw in the 5x5 pixels around was seen by chance."""
 
 _SAMPLES_OF_GUIDE = 12
-"""About how many independent pixels a guide of all samples averages: its noise, where no second half tells
-it, is that of the image divided by this."""
+"""About how many independent pixels a guide of all samples averages: its noise, which no second half tells,
+is that of the image divided by this."""
 
 
 @dataclass(frozen=True)
@@ -283,25 +283,25 @@ def divisor(albedo: FloatImage) -> FloatImage:
 
 
 def first_guides(
-    colors: tuple[FloatImage, ...], variance: FloatImage | None, guidance: tuple[Guidance, ...]
+    colors: tuple[FloatImage, ...], guidance: tuple[Guidance, ...], variance: FloatImage | None = None
 ) -> Guides:
     """Return the guides of the two halves, or of the mean alone.
 
-    How noisy guides are is told by the difference of the halves'. Of the mean alone, ``variance`` (of the
-    mean, same shape) tells it, and its own residual does where that is None.
+    How noisy guides are is told by the difference of the halves' or, of the mean alone, by its ``variance``
+    (same shape).
     """
     irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     first = FIRST_GUIDE if guidance[0].penalty else FIRST_GUIDE_WITHOUT_FEATURES
     smooth = tuple(
         np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
     )
-    guides = _guides(smooth, irradiances, variance, guidance[0])
+    guides = _guides(smooth, irradiances, guidance[0], variance)
     second = Pilot(radius=8, k=1.0, step=2)
     smooth = tuple(
         np.maximum(_regress(image, second, g, guide, guides.noise), 0)
         for image, guide, g in zip(irradiances, guides.images, guidance, strict=True)
     )
-    return _guides(smooth, irradiances, variance, guidance[0])
+    return _guides(smooth, irradiances, guidance[0], variance)
 
 
 def following_guides(
@@ -326,7 +326,7 @@ def following_guides(
         np.maximum((image - g.smooth_emission) / g.albedo, 0)
         for image, g in zip((filled_a, filled_b), guidance, strict=True)
     )
-    guides = _guides(shown, irradiances, None, guidance[0])
+    guides = _guides(shown, irradiances, guidance[0])
     return guides, (first_a, first_b), (filled_a, filled_b)
 
 
@@ -338,9 +338,9 @@ class PilotMaker:
     """
 
     colors: tuple[FloatImage, ...]
-    variance: FloatImage | None
     guidance: tuple[Guidance, ...]
     guides: Guides
+    variance: FloatImage | None = None
     previous: Halves | None = None
 
     def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
@@ -360,8 +360,8 @@ class PilotMaker:
     def _by_color(self) -> tuple[tuple[Guidance, ...], Guides]:
         guidance = tuple(_without_features(g) for g in self.guidance)
         if self.previous is not None:
-            return guidance, _guides(self.previous, self.colors, self.variance, guidance[0])
-        return guidance, first_guides(self.colors, self.variance, guidance)
+            return guidance, _guides(self.previous, self.colors, guidance[0])
+        return guidance, first_guides(self.colors, guidance, self.variance)
 
 
 def _without_features(guidance: Guidance) -> Guidance:
@@ -390,14 +390,15 @@ def _along_edges(
 def _guides(
     images: tuple[FloatImage, ...],
     irradiances: tuple[FloatImage, ...],
-    variance: FloatImage | None,
     guidance: Guidance,
+    variance: FloatImage | None = None,
 ) -> Guides:
     guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
     if len(guides) == 2:
         noise = (guides[0] - guides[1]) ** 2 / 2
     else:
-        squared = variance / guidance.albedo**2 if variance is not None else (irradiances[0] - images[0]) ** 2
+        assert variance is not None
+        squared = variance / guidance.albedo**2
         noise = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
     noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, guidance.threads)
     return Guides(guides, noise + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)

@@ -95,10 +95,10 @@ class FitResult:
     (with epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error
     around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
     half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their mean
-    with the preset draft, and with the others moved from it towards what all samples say. These are None
-    where the buffers hold no independent evidence. ``model`` is the fitted network, None where there was none
-    to fit. ``interrupted`` tells that Ctrl-C ended the fit early. ``notes`` says in one line each what
-    evidence was missing and what that meant.
+    with the preset draft, and with the others moved from it towards what all samples say. These are None with
+    the preset paper. ``model`` is the fitted network, None where there was no noise to fit one to.
+    ``interrupted`` tells that Ctrl-C ended the fit early. ``notes`` says in one line each what evidence was
+    missing and what that meant.
     """
 
     color: FloatImage

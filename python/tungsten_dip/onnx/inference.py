@@ -19,10 +19,10 @@ from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
-from tungsten_dip.fit.outcome import result_from_fused
+from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.fit.without_halves import result_without_halves
+from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
@@ -97,16 +97,19 @@ def _infer_fusion(
 ) -> FitResult:
     started = time.perf_counter()
     assert model.layout is not None
-    offered = bool(candidates) or previous is not None
-    alone = result_without_halves(buffers, settings, started, progress, offered=offered)
-    if alone is not None:
-        return alone
+    same = result_without_noise(buffers, settings, started)
+    if same is not None:
+        progress(1.0, "no noise")
+        return same
+    buffers, candidates, notes = with_independent_halves(
+        buffers, tuple(candidates), settings.seed, settings.threads
+    )
     evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress, previous)
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
         whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
     fused, whole = _fused(model, evidence, whole_pilots)
-    result = result_from_fused(evidence, fused, whole, settings, started, 0, (), ())
+    result = result_from_fused(evidence, fused, whole, settings, started, 0, (), notes)
     progress(1.0, "inferred")
     return replace(result, model=model)
 

@@ -1,0 +1,125 @@
+"""Halves for images that come without: the noise of every pixel is split at random into two.
+
+If a pixel's value is a sum of many small contributions, gamma-distributed with shape k, and T is drawn from
+Beta(k / 2, k / 2), then 2 T and 2 (1 - T) times the value are as noisy as two halves of the samples, and as
+independent (Neufeld et al. 2024, "Data Thinning for Convolution-Closed Distributions"). Whatever the
+distribution, their noise is uncorrelated if T has the right variance, which is what scoring one by the other
+needs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.prefilter import noise_in
+from tungsten_dip.buffers.statistics import HalvesTest, halves_independent
+from tungsten_dip.cores import thread_count
+from tungsten_dip.fit.evidence import exposure, scaled
+from tungsten_dip.fit.neighbours import mean_around
+
+_Plane = npt.NDArray[np.float64]
+
+_MEAN_RADIUS = 2
+_NOISE_RADIUS = 1
+"""Of the windows of the mean that a pixel differs from, and of the mean squared difference."""
+
+_LEAST_SHAPE = 1e-2
+"""One half has nearly all of such a pixel: a single sample was so bright."""
+
+_STRAY = 4.0
+"""Emission so many times that of the 8 pixels around was seen by chance: it is noise."""
+
+_LEAST_SHAPE_OF_LAMPS = 8.0
+"""Hardly any half has less than a quarter of the other one's light."""
+
+_LARGEST_SHAPE = 1e8
+"""Both halves of such a pixel are the same to float32's last digits: it has no noise."""
+
+_UNEQUAL = 0.5
+"""Halves of one and two samples are so far apart from the mean of all three, in units of half their
+difference, with room to spare."""
+
+_ROUNDED = 2e-3
+"""Relative difference that rounding to 16 bits explains."""
+
+
+def with_independent_halves(
+    buffers: RenderBuffers, candidates: tuple[Halves, ...], seed: int, threads: int | None
+) -> tuple[RenderBuffers, tuple[Halves, ...], tuple[str, ...]]:
+    """Return sanitised buffers with independent halves of the colour, candidates that these can score, notes.
+
+    Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is told by
+    how far pixels are from those around. Then no candidate can be used: whoever made it knew all of the
+    noise. The same image and seed give the same halves, whatever the exposure.
+    """
+    color = buffers.color
+    test = halves_independent(buffers, threads)
+    # Of tiny or plain images nothing tells, and halves are what they are called unless they are copies.
+    untold = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
+    if (test.independent or untold) and _belong(color):
+        return buffers, candidates, ()
+    emitted = np.zeros_like(color.mean)
+    if buffers.albedo is not None:
+        emitted = np.maximum(buffers.albedo.mean - 1, 0)
+    share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
+    notes = [f"{_why(buffers, test)}: its noise, as the pixels around tell it, is split at random into two"]
+    if candidates:
+        notes.append("the candidates are not used: what made them knew both halves of the noise")
+    split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
+    albedo = buffers.albedo
+    if albedo is not None and emitted.any():
+        # What lights emit the colour shows, too, and with the same noise.
+        surfaces = (np.minimum(half, 1) for half in albedo.halves_or_mean)
+        half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
+        variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
+        split["albedo"] = Buffer(albedo.mean, half_a, half_b, variance)
+    return buffers.with_quantities(**split), (), tuple(notes)
+
+
+def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:
+    """Return T, shape (height, width, 1), drawn as the noise around a pixel asks for."""
+    image = scaled(color, exposure(color))
+    drawn = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
+    around = _core.box_mean(image, _MEAN_RADIUS, threads)
+    apart = _sum_of_squares(image - around).astype(np.float32)[:, :, None]
+    noise = _core.box_mean(apart, _NOISE_RADIUS, threads)[:, :, 0].astype(np.float64)
+    shape = np.clip(_sum_of_squares(around) / np.maximum(noise, 1e-30), _LEAST_SHAPE, _LARGEST_SHAPE)
+    # The edges of a lamp in plain view pass for noise, but no half may be without it.
+    level = channel_mean(emitted)
+    lit = (level > 0) & (level <= np.float32(_STRAY) * mean_around(level, 1, threads))
+    shape[lit[:, :, 0]] = np.maximum(shape[lit[:, :, 0]], _LEAST_SHAPE_OF_LAMPS)
+    return drawn.beta(shape / 2, shape / 2).astype(np.float32)[:, :, None]
+
+
+def _split(image: FloatImage, share: FloatImage) -> Halves:
+    twice = 2 * image
+    return twice * share, twice * (1 - share)
+
+
+def _sum_of_squares(image: FloatImage) -> _Plane:
+    squares: _Plane = np.einsum("...c,...c", image, image, dtype=np.float64)
+    return squares
+
+
+def _belong(color: Buffer) -> bool:
+    """Whether the colour is the mean of its halves, but for rounding and for halves of unequal size."""
+    a, b = (half.astype(np.float64) for half in color.halves_or_mean)
+    apart = np.median(abs((a + b) / 2 - color.mean))
+    noise, level = np.median(abs(a - b) / 2), np.median(abs(color.mean))
+    return bool(apart <= _UNEQUAL * noise + _ROUNDED * level)
+
+
+def _why(buffers: RenderBuffers, test: HalvesTest) -> str:
+    if buffers.color.halves is None:
+        return "the image has no half buffers"
+    if np.isnan(test.correlation) and np.array_equal(*buffers.color.halves):
+        return "the image's half buffers are copies"
+    if test.independent or np.isnan(test.correlation):
+        return "the half buffers are those of another picture than the image"
+    return f"the image's half buffers are not independent (correlation {test.correlation:.2f})"

@@ -1,0 +1,61 @@
+"""Halves that are drawn from an image without any."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.fit.splitting import with_independent_halves
+
+
+def _gamma_noise(shape: float) -> RenderBuffers:
+    noisy = np.random.default_rng(3).gamma(shape, 1 / shape, (120, 160, 1)).astype(np.float32)
+    return RenderBuffers(Buffer(np.ascontiguousarray(np.broadcast_to(noisy, (120, 160, 3)))))
+
+
+def test_the_halves_of_gamma_noise_are_independent_and_as_noisy_as_real_ones() -> None:
+    for shape in (1.0, 4.0, 30.0):
+        buffers = _gamma_noise(shape)
+        split, _, notes = with_independent_halves(buffers, (), 0, 1)
+        assert "no half buffers" in notes[0]
+        assert split.color.halves is not None
+        a, b = (half[..., 0] - 1 for half in split.color.halves)
+        np.testing.assert_allclose((a + b) / 2, buffers.color.mean[..., 0] - 1, atol=1e-5)
+        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.1
+        for half in (a, b):
+            assert 0.8 < half.var() / (2 / shape) < 1.25
+
+
+def test_other_seeds_and_images_are_split_otherwise() -> None:
+    buffers = _gamma_noise(2.0)
+    other = RenderBuffers(Buffer(np.ascontiguousarray(buffers.color.mean[::-1])))
+
+    def share(image: RenderBuffers, seed: int) -> np.ndarray:
+        half = with_independent_halves(image, (), seed, 1)[0].color.half_a
+        assert half is not None
+        return half / image.color.mean
+
+    np.testing.assert_array_equal(share(buffers, 0), share(buffers, 0))
+    assert (share(buffers, 0) != share(buffers, 1)).mean() > 0.9
+    assert (share(buffers, 0) != share(other, 0)).mean() > 0.9
+
+
+def test_what_has_no_noise_is_not_torn_apart() -> None:
+    flat = RenderBuffers(Buffer(np.full((20, 30, 3), 0.7, np.float32)))
+    halves = with_independent_halves(flat, (), 0, 1)[0].color.halves
+    assert halves is not None
+    for half in halves:
+        np.testing.assert_allclose(half, 0.7, rtol=1e-3)
+
+
+def test_emitted_light_is_split_as_the_colour_is() -> None:
+    color = np.random.default_rng(5).gamma(2, 0.5, (40, 40, 3)).astype(np.float32)
+    albedo = np.full_like(color, 0.5)
+    color[10:20, 10:20] = albedo[10:20, 10:20] = 9
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1)[0]
+    assert split.color.halves is not None
+    assert split.albedo is not None
+    assert split.albedo.halves is not None
+    for light, emitted in zip(split.color.halves, split.albedo.halves, strict=True):
+        np.testing.assert_allclose((emitted - 1)[10:20, 10:20] / 8, light[10:20, 10:20] / 9, rtol=1e-5)
+        np.testing.assert_array_equal(emitted[25:], albedo[25:])
