@@ -113,7 +113,7 @@ PaddedPlanes structure_tensor(ConstImage features, int edge, int threads) {
         for (int c = 0; c < 3; ++c) {
             convolve_columns<tensor_radius>(products, c, y, window, columns);
             convolve_row<tensor_radius>(columns, window, smoothed);
-            std::copy(smoothed.begin(), smoothed.end(), tensor.row(c, y));
+            std::ranges::copy(smoothed, tensor.row(c, y));
         }
     });
     tensor.repeat_border();
