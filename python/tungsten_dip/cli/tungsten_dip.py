@@ -92,7 +92,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_output_options(denoise)
     add_fit_options(denoise, prefix="")
     add("--iterations", metavar="N", type=int, help="stop the fit after this many iterations")
-    add("--seed", metavar="N", type=int, help="of the network's first weights and its input (default: 0)")
+    add(
+        "--seed",
+        metavar="N",
+        type=int,
+        help="of first weights, input noise and halves that are drawn (default: 0)",
+    )
     add_threads(denoise)
     types = get_type_hints(FitSettings)
     paper = denoise.add_argument_group("the network of the published method, with --preset paper")

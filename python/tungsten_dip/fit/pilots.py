@@ -102,6 +102,7 @@ FINAL_PILOTS = (
     Pilot(32, k=2.0, step=4, with_position=True),
 )
 
+# Enough beside what the previous frame shows. The first stands where that shows nothing.
 FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES)
 FOLLOWING_PILOTS = (
     *FOLLOWING_DRAFT_PILOTS,
@@ -109,8 +110,6 @@ FOLLOWING_PILOTS = (
     Pilot(6, k=2.0, step=2),
     Pilot(4, k=1.0, by_color=True),
 )
-"""Enough beside what the previous frame shows, as those of draft are for a look. The first stands where that
-shows nothing."""
 
 
 @dataclass(frozen=True)

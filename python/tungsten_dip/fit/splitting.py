@@ -32,8 +32,9 @@ _NOISE_RADIUS = 1
 _LEAST_SHAPE = 1e-2
 """One half has nearly all of such a pixel: a single sample was so bright."""
 
-_STRAY = 4.0
-"""Emission so many times that of the 8 pixels around was seen by chance: it is noise."""
+_STRAY = 8 / 3
+"""Emission so many times the mean of the 8 pixels around was seen by chance: a lamp's corner has three lit
+neighbours."""
 
 _LEAST_SHAPE_OF_LAMPS = 8.0
 """Hardly any half has less than a quarter of the other one's light."""
