@@ -6,11 +6,16 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fitted_models import DRAFT
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.fit import FitResult, denoise
+from tungsten_dip.fit.model import Model
+from tungsten_dip.onnx import save_model
 
 SAMPLE_SHAPE = 0.5
 """Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""
@@ -89,6 +94,38 @@ def make_render() -> MakeRender:
 def render() -> SyntheticRender:
     """The synthetic render at its default size."""
     return synthetic_render()
+
+
+@pytest.fixture(scope="session")
+def frame() -> SyntheticRender:
+    """The image that `model` is fitted to."""
+    return synthetic_render(32, 48)
+
+
+@pytest.fixture(scope="session")
+def next_frame() -> SyntheticRender:
+    """The same with other noise."""
+    return synthetic_render(32, 48, seed=1)
+
+
+@pytest.fixture(scope="session")
+def fitted(frame: SyntheticRender) -> FitResult:
+    """What a short fit of preset draft makes of `frame`."""
+    return denoise(frame.buffers, DRAFT)
+
+
+@pytest.fixture(scope="session")
+def model(fitted: FitResult) -> Model:
+    """The network of that fit."""
+    assert fitted.model is not None
+    return fitted.model
+
+
+@pytest.fixture
+def saved(model: Model, tmp_path: Path) -> Path:
+    """The file of that network."""
+    save_model(tmp_path / "m.onnx", model)
+    return tmp_path / "m.onnx"
 
 
 def synthetic_render(height: int = 40, width: int = 56, spp: int = 16, seed: int = 0) -> SyntheticRender:

@@ -143,16 +143,6 @@ def test_half_floats(folder, tmp_path, fits):
     assert str(spec.channelformat(spec.channelindex("R"))) == "half"
 
 
-def test_an_error_map_that_cannot_be_known_is_not_silently_left_out(tmp_path, fits, render, capfd):
-    write_tungsten_folder(tmp_path / "buffers", RenderBuffers(Buffer(render.buffers.color.mean)))
-    out, error = tmp_path / "out.exr", tmp_path / "error.exr"
-    status = command.main(["denoise", str(tmp_path / "buffers"), "-o", str(out), "--error-map", str(error)])
-    assert status == 2
-    assert out.exists()
-    assert not error.exists()
-    assert str(error) in capfd.readouterr().err
-
-
 def test_values_that_are_not_finite_are_mended_before_the_fit(tmp_path, render, capfd):
     color = render.buffers.color.mean.copy()
     color[3, 4] = np.nan

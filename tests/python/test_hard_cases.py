@@ -62,7 +62,7 @@ def test_every_way_stays_finite(way: str, case: HardCase, undamaged: FitResult) 
     assert undamaged.model is not None
     few = replace(DRAFT, iterations=5)
     if case.group == "Features" and way in ("warm start", "onnxruntime") and "none" in case.name:
-        pytest.skip("a network of other features is refused, which test_onnx.py proves")
+        pytest.skip("a network of other features is refused, which test_warm_start.py proves")
     ways: dict[str, Callable[[], FitResult]] = {
         "balanced": lambda: denoise(damaged.buffers, replace(few, preset="balanced")),
         "final": lambda: denoise(damaged.buffers, replace(few, preset="final")),

@@ -44,7 +44,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs, Preset
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
 
@@ -156,9 +156,9 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     settings = fit_settings(options, names, warm_start)
     if fixed and settings.preset != "paper":
         raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
-    if settings.preset == "paper" and options.error_map is not None:
-        raise InputError("--error-map: the published method knows no error; choose another preset")
-    return _denoised(options, lambda buffers: denoise_with_progress(buffers, settings, warm_start))
+    return _denoised(
+        options, settings.preset, lambda buffers: denoise_with_progress(buffers, settings, warm_start)
+    )
 
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -170,13 +170,15 @@ def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
                 model, buffers, progress, threads=options.threads, refit_steps=options.refit
             )
 
-    return _denoised(options, infer)
+    return _denoised(options, model.settings.preset, infer)
 
 
 def _denoised(
-    options: argparse.Namespace, denoise: Callable[[RenderBuffers], FitResult]
+    options: argparse.Namespace, preset: Preset, denoise: Callable[[RenderBuffers], FitResult]
 ) -> tuple[dict[str, Any], str]:
     """Read the buffers, denoise them, write all that the options ask for."""
+    if preset == "paper" and options.error_map is not None:
+        raise InputError("--error-map: the published method knows no error; use another preset")
     suffixes = {"output": ".exr", "error_map": ".exr", "report": ".html", "save_model": ".onnx"}
     for name, suffix in suffixes.items():
         if getattr(options, name) is not None:
@@ -200,10 +202,7 @@ def _denoised(
     if options.save_model is not None:
         write_model(options.save_model, result)
     if options.error_map is not None:
-        if result.error is None:
-            raise InputError(
-                f"{options.error_map}: not written: the preset paper does not know its error; use another"
-            )
+        assert result.error is not None
         write_image(options.error_map, result.error)
 
     facts = {

@@ -1,0 +1,33 @@
+"""Small fitted networks, for every test that saves, loads, uses or goes on training one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tungsten_dip.buffers import RenderBuffers
+from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
+from tungsten_dip.fit.model import Model
+from tungsten_dip.graphs.sessions import session_from_proto
+from tungsten_dip.onnx.graph import graph_of
+from tungsten_dip.progress import silent
+
+DRAFT = FitSettings("draft", iterations=20, threads=1, device="cpu")
+
+
+def paper_model(network: str, buffers: RenderBuffers, **changes: Any) -> Model:
+    """Return a network of the published method after one iteration; ``changes`` are of its settings."""
+    chosen = {"channels": (4, 6, 8), "iterations": 1, "threads": 1, "device": "cpu", **changes}
+    result = denoise(buffers, FitSettings("paper", network=network, **chosen))  # type: ignore[arg-type]
+    assert result.model is not None
+    return result.model
+
+
+def session_of(model: Model) -> Any:
+    """Return an onnxruntime session of the model's graph."""
+    return session_from_proto(graph_of(model, {}), 1)
+
+
+def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
+    """Return what a fit of preset draft knows of the buffers, with other pilots."""
+    return evidence_from_buffers(buffers, DRAFT, pilots, (), 0.0, silent)

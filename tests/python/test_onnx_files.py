@@ -1,0 +1,104 @@
+"""Models as files: what is saved is read again."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit import FitSettings
+from tungsten_dip.fit.evidence import Layout
+from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.pilots import Pilot
+from tungsten_dip.fit.planes import Standardisation
+from tungsten_dip.fit.training import first_weights
+from tungsten_dip.onnx import file as model_file
+from tungsten_dip.onnx import load_model, save_model
+from tungsten_dip.onnx.file import proto_from_model
+
+
+def assert_same(first: Model, second: Model) -> None:
+    for name, value in asdict(first).items():
+        if name in ("weights", "standardisation", "settings"):
+            continue
+        assert asdict(second)[name] == value
+    assert first.weights.keys() == second.weights.keys()
+    for name, weight in first.weights.items():
+        np.testing.assert_array_equal(second.weights[name], weight)
+    if first.standardisation is not None:
+        assert second.standardisation is not None
+        np.testing.assert_array_equal(second.standardisation.mean, first.standardisation.mean)
+        np.testing.assert_array_equal(second.standardisation.std, first.standardisation.std)
+
+
+def test_round_trip(model: Model, saved: Path) -> None:
+    loaded = load_model(saved)
+    assert_same(model, loaded)
+    assert loaded.settings.preset == "draft"
+    assert loaded.settings.iterations == 20
+    assert (len(loaded.source_sha256), loaded.version) == (64, model.version)
+    save_model(saved.with_name("again.onnx"), loaded)
+    assert saved.with_name("again.onnx").read_bytes() == saved.read_bytes()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    features=strategies.lists(strategies.sampled_from(["albedo.R", "normal.X", "depth.Z"]), unique=True),
+    pilots=strategies.lists(
+        strategies.builds(
+            Pilot,
+            radius=strategies.integers(1, 32).map(lambda r: 2 * r),
+            k=strategies.none() | strategies.floats(0.1, 10),
+            step=strategies.sampled_from([1, 2]),
+            with_position=strategies.booleans(),
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+    candidates=strategies.integers(0, 2),
+    relmse=strategies.none() | strategies.floats(0, 1e9),
+    seed=strategies.integers(0, 2**63 - 1),
+    data=strategies.data(),
+)
+def test_every_model_survives_its_file(
+    features: list[str],
+    pilots: list[Pilot],
+    candidates: int,
+    relmse: float | None,
+    seed: int,
+    data: strategies.DataObject,
+) -> None:
+    reference = data.draw(strategies.integers(1, len(pilots) + candidates))
+    layout = Layout(tuple(features), tuple(pilots), candidates, reference)
+    planes = len(layout.planes)
+    constants = Standardisation(np.linspace(-9, 9, planes), np.full(planes, 0.3, np.float32))
+    fit = Model(
+        "pointwise",
+        layout.planes,
+        first_weights(layout, seed),
+        FitSettings("final", seed=seed),
+        relmse,
+        "0" * 64,
+        layout,
+        constants,
+    )
+    again = model_file._model_from_bytes(proto_from_model(fit).SerializeToString())
+    assert_same(fit, again)
+
+
+def test_a_model_is_written_whole_or_not_at_all(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match=r"ends in \.onnx"):
+        save_model(tmp_path / "m.pt", model)
+    monkeypatch.setattr(model_file, "LARGEST_FILE_BYTES", 100)
+    with pytest.raises(InputError, match="at most"):
+        save_model(tmp_path / "m.onnx", model)
+    weights = {**model.weights, "layer2.bias": np.zeros(3, np.float32)}
+    with pytest.raises(InputError, match=r"layer2\.bias: expected shape \(16,\), found shape \(3,\)"):
+        save_model(tmp_path / "m.onnx", replace(model, weights=weights))
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,141 @@
+"""One training step as an ONNX graph, and what the network is shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+from conftest import SyntheticRender, synthetic_render
+from fitted_models import DRAFT, evidence_of
+from tungsten_dip.fit import denoise
+from tungsten_dip.fit.evidence import Layout
+from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.pilots import Pilot
+from tungsten_dip.fit.planes import PLANES_RADIUS, network_inputs, planes_of_half
+from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, training_step, weight_shapes
+from tungsten_dip.fit.training import first_weights, start_of_training
+from tungsten_dip.graphs.sessions import session_from_proto
+from tungsten_dip.onnx import infer
+
+torch = pytest.importorskip("torch")
+
+from torch_network import TorchNetwork  # noqa: E402
+
+
+def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
+    evidence = evidence_of(synthetic_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
+    return start_of_training(evidence, seed).examples, evidence.layout
+
+
+@pytest.mark.parametrize("pixels", [1, 37, 480])
+def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
+    examples, layout = examples_for_training()
+    weights = first_weights(layout, seed=3)
+    rng = np.random.default_rng(4)
+    for name, value in weights.items():
+        weights[name] = value + rng.normal(0, 0.3, value.shape).astype(np.float32)
+    batch = examples.at(rng.integers(2 * 480, size=pixels))
+
+    in_torch = TorchNetwork(weights)
+    in_onnx = PointwiseNetwork(weights, len(layout.planes), layout.choices)
+    proto = training_step(len(layout.planes), layout.choices)
+    onnx.checker.check_model(proto, full_check=True)
+    vector = np.concatenate([value.ravel() for value in weights.values()])
+    feeds = {
+        "inputs": batch.inputs,
+        "choices": batch.choices,
+        "wanted": batch.wanted,
+        "weight": batch.weight,
+        "weights": vector,
+        "mean": np.zeros_like(vector),
+        "square": np.zeros_like(vector),
+        "learning_rate": np.array([1e-2], np.float32),
+        "step": np.array([1], np.float32),
+    }
+    gradient, loss = session_from_proto(proto, 1).run(["gradient", "loss"], feeds)
+
+    expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(batch)])
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    squared = (in_onnx.fuse(batch) - batch.wanted) ** 2 * batch.weight
+    assert loss == pytest.approx(squared.mean(), rel=1e-4)
+
+    for _ in range(5):
+        for network in (in_torch, in_onnx):
+            network.step(batch, 1e-2)
+    for name, value in in_torch.weights().items():
+        np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-4, atol=1e-4)
+
+
+def test_gradients_are_those_of_the_loss() -> None:
+    """Against central differences in double precision, without torch."""
+    rng = np.random.default_rng(0)
+    planes, choices, pixels = 3, 2, 5
+    shapes = weight_shapes(planes, choices)
+    vector = rng.normal(0, 0.5, sum(int(np.prod(s)) for s in shapes.values()))
+    feeds = {
+        "inputs": rng.normal(size=(pixels, planes)),
+        "choices": rng.random((pixels, choices, 3)),
+        "wanted": rng.random((pixels, 3)),
+        "weight": rng.random((pixels, 1)),
+    }
+
+    def loss(weights: Any) -> float:
+        x, first = feeds["inputs"], 0
+        for layer in (1, 2, 3):
+            parts = []
+            for name in ("weight", "bias"):
+                shape = shapes[f"layer{layer}.{name}"]
+                parts.append(weights[first : first + int(np.prod(shape))].reshape(shape))
+                first += int(np.prod(shape))
+            x = x @ parts[0].T + parts[1]
+            x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
+        shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
+        fused = (shares[:, :, None] * feeds["choices"]).sum(1)
+        return float(np.mean(feeds["weight"] * (fused - feeds["wanted"]) ** 2))
+
+    expected = [(loss(vector + d) - loss(vector - d)) / 2e-6 for d in 1e-6 * np.eye(vector.size)]
+    zeros = np.zeros(vector.size, np.float32)
+    single = {name: value.astype(np.float32) for name, value in {**feeds, "weights": vector}.items()}
+    one = np.ones(1, np.float32)
+    state = {"mean": zeros, "square": zeros, "learning_rate": one, "step": one}
+    gradient = session_from_proto(training_step(planes, choices), 1).run(["gradient"], {**single, **state})[0]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_refit_does_what_a_warm_start_does(model: Model, next_frame: SyntheticRender) -> None:
+    refit = infer(model, next_frame.buffers, threads=1, refit_steps=30)
+    warm = denoise(next_frame.buffers, replace(DRAFT, iterations=30), warm_start=model)
+    assert 0 < refit.iterations == warm.iterations <= 30
+    np.testing.assert_allclose(refit.color, warm.color, rtol=1e-3)
+    assert refit.model is not None
+    assert refit.model.source_sha256 != model.source_sha256
+    assert refit.model.settings.iterations == 30
+    again = infer(refit.model, next_frame.buffers, threads=1)
+    np.testing.assert_allclose(again.color, refit.color, rtol=1e-5)
+
+
+def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
+    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    whole = network_inputs(evidence).reshape(2, 32, 48, -1)
+    upper = network_inputs(evidence.rows(0, 28)).reshape(2, 28, 48, -1)
+    lower = network_inputs(evidence.rows(4, 32)).reshape(2, 28, 48, -1)
+    inner = 28 - PLANES_RADIUS
+    np.testing.assert_allclose(upper[:, :inner], whole[:, :inner], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(lower[:, -inner:], whole[:, -inner:], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("changed", ["seen", "scoring"])
+def test_the_network_sees_the_noise_of_no_pixel_at_that_pixel(changed: str, frame: SyntheticRender) -> None:
+    # Neither the half's own, which it would choose for being dark, nor the other's, which it is scored by.
+    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    y, x, half = 11, 17, 0
+    noisy = [image.copy() for image in evidence.halves]
+    noisy[half if changed == "seen" else 1 - half][y, x] *= 3
+    other = replace(evidence, pilots=((noisy[0], noisy[1]), *evidence.pilots[1:]))
+    before, after = (np.stack(list(planes_of_half(e, half)), axis=2) for e in (evidence, other))
+    np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
+    assert np.abs(after - before).max() > 0.01

@@ -1,0 +1,199 @@
+"""Networks that start from those of another image, and the commands that save and load them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import SyntheticRender
+from fitted_models import DRAFT, paper_model
+from tungsten_dip.buffers import Buffer, write_tungsten_folder
+from tungsten_dip.cli import tungsten_dip as command
+from tungsten_dip.errors import InputError
+from tungsten_dip.fit import FitResult, denoise
+from tungsten_dip.fit.model import Model
+from tungsten_dip.onnx import infer, load_model, save_model
+
+
+def test_a_warm_start_starts_from_the_weights_and_constants(
+    model: Model, fitted: FitResult, next_frame: SyntheticRender, frame: SyntheticRender
+) -> None:
+    again = denoise(frame.buffers, replace(DRAFT, iterations=1), warm_start=model)
+    assert again.iterations == 1
+    assert again.history[0].iteration == 0
+    assert again.model is not None
+    for name, value in model.weights.items():
+        np.testing.assert_allclose(again.model.weights[name], value, atol=5e-4)
+    np.testing.assert_allclose(again.color, fitted.color, rtol=0.02)
+
+    other = denoise(next_frame.buffers, replace(DRAFT, iterations=1), warm_start=model)
+    assert other.model is not None
+    assert model.standardisation is not None
+    assert other.model.standardisation is not None
+    np.testing.assert_array_equal(other.model.standardisation.mean, model.standardisation.mean)
+    assert other.model.layout == model.layout
+    assert other.model.source_sha256 != model.source_sha256
+
+
+def test_a_warm_start_ends_when_the_error_falls_no_further(
+    frame: SyntheticRender, next_frame: SyntheticRender
+) -> None:
+    def relmse(result: FitResult) -> float:
+        truth = next_frame.reference
+        return float(np.mean((result.color - truth) ** 2 / (truth**2 + 0.01)))
+
+    long = replace(DRAFT, iterations=150)
+    trained = denoise(frame.buffers, long).model
+    cold = denoise(next_frame.buffers, long)
+    warm = denoise(next_frame.buffers, replace(DRAFT, iterations=150), warm_start=trained)
+    assert warm.iterations < 100
+    assert any("falls no further" in note for note in warm.notes)
+    assert relmse(warm) < 1.25 * relmse(cold)
+    # Without settings, those of the model hold.
+    assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
+
+
+@pytest.mark.parametrize("by", ["torch", "onnxruntime"])
+def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
+    by: str, model: Model, frame: SyntheticRender
+) -> None:
+    albedo = frame.buffers.albedo
+    assert albedo is not None
+    light = Buffer(*(20 * plane for _, plane in albedo.planes()))
+    unlike = frame.buffers.with_quantities(albedo=light)
+    if by == "torch":
+        result = denoise(unlike, replace(DRAFT, iterations=20), warm_start=model)
+        # Only which pilot the others are compared with is the model's own.
+        cold = denoise(unlike, replace(DRAFT, iterations=20))
+        np.testing.assert_allclose(result.color, cold.color, rtol=1e-3, atol=1e-4)
+    else:
+        result = infer(model, unlike, threads=1, refit_steps=20)
+    assert "the model knows no such images: a network is fitted anew" in result.notes
+    assert result.iterations == 20
+    assert result.model is not None
+    assert result.model.standardisation is not None
+    assert model.standardisation is not None
+    assert not np.array_equal(result.model.standardisation.mean, model.standardisation.mean)
+    # What is written is a model that can be used.
+    assert np.isfinite(infer(result.model, unlike, threads=1).color).all()
+
+
+def test_a_paper_network_starts_from_the_weights(frame: SyntheticRender) -> None:
+    fit = paper_model("resnet", frame.buffers)
+    again = denoise(frame.buffers, replace(fit.settings, iterations=1), warm_start=fit)
+    assert again.model is not None
+    for name, value in fit.weights.items():
+        np.testing.assert_allclose(again.model.weights[name], value, atol=3e-3)
+
+
+def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
+    model: Model, frame: SyntheticRender
+) -> None:
+    buffers = frame.buffers
+    without = buffers.with_quantities(normal=None)
+    for use in (lambda b: infer(model, b), lambda b: denoise(b, DRAFT, warm_start=model)):
+        with pytest.raises(InputError, match=r"fitted with normal\.X, normal\.Y, normal\.Z, which"):
+            use(without)
+    with pytest.raises(InputError, match="fitted with preset draft, this fit asks for balanced"):
+        denoise(buffers, replace(DRAFT, preset="balanced"), warm_start=model)
+    with pytest.raises(InputError, match="fitted with 0 candidates, this input comes with 1"):
+        denoise(buffers, DRAFT, candidates=[(frame.reference, frame.reference)], warm_start=model)
+
+    paper = paper_model("skip", buffers)
+    with pytest.raises(InputError, match="fitted with preset paper, this fit asks for draft"):
+        denoise(buffers, DRAFT, warm_start=paper)
+    with pytest.raises(InputError, match="network skip, this fit asks for resnet"):
+        denoise(buffers, replace(paper.settings, network="resnet"), warm_start=paper)
+    with pytest.raises(InputError, match="channels 4,6,8, this fit asks for 4,6"):
+        denoise(buffers, replace(paper.settings, channels=(4, 6)), warm_start=paper)
+    with pytest.raises(InputError, match=r"lacks normal mean 0"):
+        infer(paper, without)
+
+
+WITHOUT_EXTRAS = """
+import sys
+for name in ('torch', 'mitsuba', 'skimage', 'flip_evaluator'):
+    sys.modules[name] = None  # to import it is an error
+from tungsten_dip.cli.tungsten_dip import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_the_commands_of_the_base_installation_do_without_torch(
+    saved: Path, tmp_path: Path, frame: SyntheticRender, next_frame: SyntheticRender
+) -> None:
+    write_tungsten_folder(tmp_path / "in", next_frame.buffers)
+
+    def run(*arguments: Any) -> str:
+        program = [sys.executable, "-c", WITHOUT_EXTRAS, *map(str, arguments)]
+        done = subprocess.run(program, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    run("inspect", tmp_path / "in")
+    refined = tmp_path / "refined.onnx"
+    out = tmp_path / "out.exr"
+    told = run(
+        "infer", saved, tmp_path / "in", "-o", out, "--refit", 5, "--threads", 1, "--save-model", refined
+    )
+    assert "5 iterations" in told
+    assert out.exists()
+    assert load_model(refined).layout == load_model(saved).layout
+    run("infer", refined, tmp_path / "in", "-o", tmp_path / "again.exr", "--error-map", tmp_path / "e.exr")
+    assert "psnr" in run("compare", out, tmp_path / "again.exr").lower()
+
+
+def test_save_and_warm_start_on_the_command_line(
+    tmp_path: Path, frame: SyntheticRender, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_tungsten_folder(tmp_path / "in", frame.buffers)
+    fit = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out.exr"), "--threads", "1"]
+    first, second = str(tmp_path / "1.onnx"), str(tmp_path / "2.onnx")
+    assert command.main([*fit, "--preset", "draft", "--iterations", "5", "--save-model", first]) == 0
+    # The preset is the model's.
+    assert command.main([*fit, "--iterations", "3", "--warm-start", first, "--save-model", second]) == 0
+    assert load_model(second).settings.preset == "draft"
+    assert load_model(second).settings.iterations == 3
+    capfd.readouterr()
+    assert command.main([*fit, "--preset", "final", "--warm-start", first]) == 2
+    assert "fitted with preset draft, this fit asks for final" in capfd.readouterr().err
+    assert command.main([*fit, "--warm-start", str(tmp_path / "in" / "color.exr")]) == 2
+    assert command.main([*fit, "--save-model", str(tmp_path / "m.pt")]) == 2
+    truth = frame.reference
+    color = Buffer(truth, truth * np.float32(0.9999), truth * np.float32(1.0001))
+    write_tungsten_folder(tmp_path / "clean", frame.buffers.with_quantities(color=color))
+    capfd.readouterr()
+    clean = ["denoise", str(tmp_path / "clean"), "-o", str(tmp_path / "clean.exr"), "--threads", "1"]
+    assert command.main([*clean, "--save-model", str(tmp_path / "none.onnx")]) == 2
+    assert "no network was fitted" in capfd.readouterr().err
+    assert not (tmp_path / "none.onnx").exists()
+
+
+def test_an_error_that_cannot_be_known_is_refused_before_the_work(
+    tmp_path: Path, frame: SyntheticRender, capfd: pytest.CaptureFixture[str]
+) -> None:
+    save_model(tmp_path / "paper.onnx", paper_model("resnet", frame.buffers))
+    write_tungsten_folder(tmp_path / "in", frame.buffers)
+    rest = [str(tmp_path / "in"), "-o", str(tmp_path / "out.exr"), "--error-map", str(tmp_path / "e.exr")]
+    for first in (["denoise", "--preset", "paper"], ["infer", str(tmp_path / "paper.onnx")]):
+        assert command.main([*first, *rest]) == 2
+        assert "--error-map: the published method knows no error" in capfd.readouterr().err
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:
+    program = (
+        "from tungsten_dip.fit.pointwise import training_step\n"
+        "from tungsten_dip.graphs.sessions import session_from_proto\n"
+        "session_from_proto(training_step(2, 2), 1)"
+    )
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "ORT_"))}
+    subprocess.run([sys.executable, "-c", program], env={**kept, "HOME": str(tmp_path)}, check=True)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
