@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 from tungsten_dip.interrupts import held_interrupts
 
 if TYPE_CHECKING:
-    from tungsten_dip.buffers.image_file import read_image, write_image
+    from tungsten_dip.buffers.image_file import write_image
     from tungsten_dip.buffers.model import Buffer, RenderBuffers
-    from tungsten_dip.buffers.read import read_buffers
+    from tungsten_dip.buffers.read import read_buffers, read_image
     from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
@@ -45,7 +45,7 @@ _MODULE_BY_NAME = {
     "load_model": "onnx",
     "load_scene": "scene.parse",
     "read_buffers": "buffers.read",
-    "read_image": "buffers.image_file",
+    "read_image": "buffers.read",
     "render": "hosts",
     "save_model": "onnx",
     "write_denoised": "buffers.write",

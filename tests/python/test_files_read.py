@@ -535,6 +535,13 @@ def test_without_colour(tmp_path: Path) -> None:
         read_image(tmp_path / "a.exr")
 
 
+def test_the_picture_of_a_file_without_one_at_the_top_level_is_its_colour(tmp_path: Path) -> None:
+    channels = save(tmp_path / "a.exr", *rgb("ViewLayer.Combined"), "ViewLayer.Depth.Z")
+    picture = read_image(tmp_path / "a.exr")
+    for index, name in enumerate(rgb("ViewLayer.Combined")):
+        assert np.array_equal(picture[:, :, index], channels[name])
+
+
 def test_depth_of_three_different_channels(tmp_path: Path) -> None:
     save(tmp_path / "a.exr", *"RGB", *rgb("depth"))
     refused(tmp_path / "a.exr", "depth: expected 1 channels")

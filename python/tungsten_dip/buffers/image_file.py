@@ -20,7 +20,6 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import replacing
-from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -58,22 +57,6 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: not enough memory to read it ({error}); free some, or crop it") from error
     except (RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
-
-
-def read_image(path: str | Path) -> FloatImage:
-    """Read the picture that a viewer would show: the top-level R, G, B (or Y) of the first part.
-
-    Returns linear radiance, float32, shape (height, width, 3).
-
-    Raises InputError as read_parts does, or if there is no such channel.
-    """
-    path = Path(path)
-    channels = read_parts(path)[0].channels
-    names = next((names for names in ("RGB", "Y") if all(name in channels for name in names)), None)
-    if names is None:
-        raise InputError(f"{path}: expected channels R, G, B or Y, found {', '.join(channels)}")
-    image = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
-    return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
 
 
 def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> None:

@@ -55,6 +55,29 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
 
 
+def read_image(path: str | Path) -> FloatImage:
+    """Read the picture that a viewer would show: the top-level R, G, B (or Y) of the first part.
+
+    Where there are none, as in files of Blender, it is the colour that `read_buffers` finds. Returns linear
+    radiance, float32, shape (height, width, 3).
+
+    Raises InputError if the file is missing, damaged or no image, or if there is no colour.
+    """
+    path = Path(path)
+    channels = read_parts(path)[0].channels
+    names = next((names for names in ("RGB", "Y") if all(name in channels for name in names)), None)
+    if names is None:
+        try:
+            return read_buffers(path).color.mean
+        except InputError as error:
+            found = ", ".join(channels)
+            raise InputError(
+                f"{path}: expected channels R, G, B or Y, found {found}; name another file"
+            ) from error
+    image = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
+    return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+
+
 def input_files(path: str | Path, mapping: Mapping[str, str] | None = None) -> list[Path]:
     """Return the files that `read_buffers` reads, whose change is a change of the input.
 

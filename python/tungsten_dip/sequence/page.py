@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers.image_file import read_image
 from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.read import read_image
 from tungsten_dip.report import parts
 from tungsten_dip.report.parts import Picture
 from tungsten_dip.scene.tonemap import display_from_radiance
