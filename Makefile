@@ -86,7 +86,7 @@ $(VENV)/installed: $(VENV)/created constraints.txt $(BUILD_FILES) $(CXX_SOURCES)
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' \
 		>$(VENV)/build-requirements.txt
 	$(PIP) --requirement $(VENV)/build-requirements.txt
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[all]'
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[mitsuba]'
 	@touch $@
 
 $(VENV)/developing: $(VENV)/installed

@@ -1,6 +1,7 @@
 """Builds the C++ parts with CMake; all metadata is in pyproject.toml."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,10 +19,13 @@ class CMakeBuild(build_ext):
         source = root / "python" / "tungsten_dip"
         package_dir = source if self.editable_mode else Path(self.build_lib).resolve() / "tungsten_dip"
         build_dir = root / "build" / "pip"
+        # A cache of an earlier build may name a ninja that pip has removed since.
+        ninja = shutil.which("ninja") or "ninja"
         subprocess.check_call(
             [
                 "cmake", "-S", root, "-B", build_dir, "-G", "Ninja", "-DCMAKE_BUILD_TYPE=Release",
                 f"-DPython_EXECUTABLE={sys.executable}", f"-DTUNGSTEN_DIP_PACKAGE_DIR={package_dir}",
+                f"-DCMAKE_MAKE_PROGRAM={ninja}",
             ]
         )  # fmt: skip
         jobs = os.environ.get("CMAKE_BUILD_PARALLEL_LEVEL", str(os.cpu_count() or 1))

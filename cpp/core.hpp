@@ -81,8 +81,8 @@ BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads)
 
 // Replaces every defect in place; images without defects are not written to.
 // - negative values become 0, and so does an infinite depth: the ray left the scene. Negative radiance of up
-//   to a quarter of what is around (3x3 pixels) is a filter's lobe, and taken from there; nothing else than
-//   defects is changed but for that;
+//   to a quarter of what is around (3x3 pixels) is a filter's lobe, and taken from there; apart from this
+//   only defects are changed;
 // - mean, half_a and half_b follow from one another (mean = (half_a + half_b) / 2) where two of them are
 //   sane; both halves are the mean where it alone is sane;
 // - a variance (a negative one as well) follows from the halves: (half_a - half_b)^2 / 4, averaged over 3x3

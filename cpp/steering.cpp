@@ -1,4 +1,5 @@
-// Smoothing along edges: what remains to be done where few samples saw which surface covers a pixel.
+// Smoothing along the edges of features, with Gaussians that the structure tensor steers: few samples saw how
+// much of a pixel each surface covers, and those of its neighbours along the edge tell more.
 #include <algorithm>
 #include <array>
 #include <cmath>

@@ -7,4 +7,7 @@ import os
 
 def thread_count(threads: int | None) -> int:
     """Return ``threads`` or, for None, one for each core that this process may run on."""
-    return threads or len(os.sched_getaffinity(0))
+    if threads:
+        return threads
+    # macOS and Windows do not tell.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Ctrl-C where Python must not raise it at once, or not only then."""
+"""Defers Ctrl-C while libraries load, and raises it again after a fit that it ended early."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ def heeded_interrupts() -> AbstractContextManager[None]:
 
 @contextmanager
 def _noted_interrupts(at_once: bool) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    # A job in the background of a shell ignores Ctrl-C; None is a handler that Python does not know.
+    if not in_main_thread or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
         yield
         return
     pressed = False

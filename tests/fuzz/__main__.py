@@ -10,7 +10,6 @@ import logging
 import re
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import atheris
@@ -20,6 +19,7 @@ with atheris.instrument_imports(include=["tungsten_dip"]):
     from tungsten_dip.errors import InputError
 
 MOST_BYTES = 1 << 16
+FOLDER = Path(__file__).parents[2] / "build" / "fuzz"
 
 
 def main() -> int:
@@ -48,9 +48,10 @@ def _fuzz(name: str, seconds: int) -> None:
     """Does not return."""
     logging.disable(logging.CRITICAL)
     reader = READERS[name]
-    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    # What an earlier run found to reach new code is kept, and gone on from.
+    folder = FOLDER / re.sub(r"\W+", "-", name)
     corpus = folder / "corpus"
-    corpus.mkdir()
+    corpus.mkdir(parents=True, exist_ok=True)
     for number, example in enumerate(reader.examples()):
         (corpus / str(number)).write_bytes(example)
     path = folder / f"input{reader.suffix}"

@@ -36,16 +36,6 @@ LEAST_FAR = 0.5
 MOST_HARM = 1.5
 """How many times larger the error of good pixels may be than without the damage."""
 
-PROMISES = {
-    "finite": "every value of the image and of its error map is finite and none is negative",
-    "mean": "the mean radiance of pixels out of reach of the damage is within 1% of the input's, or within "
-    "the standard error of that",
-    "error": "the error of undamaged pixels is no larger than the input's, or below 1e-4",
-    "harm": "out of reach of the damage, the error is at most 1.5 times that without the damage",
-    "seed": "the same seed gives the same bits again",
-    "exposure": "radiance times 2^k gives the result times 2^k",
-}
-
 
 @dataclass(frozen=True)
 class Damaged:

@@ -209,7 +209,7 @@ def test_bad_buffers(spoil, folder, tmp_path, fits, capfd):
         ("{folder} -o {tmp}/out.exr --time-budget=-5s", ["--time-budget", "90s", "-5s"]),
         ("{folder} -o {tmp}/out.exr --iterations -1", ["iterations"]),
         ("{folder} -o {tmp}/out.exr --target-error nan", ["target_error"]),
-        ("{folder} -o {tmp}/out.exr --network resnet", ["--network", "--preset paper"]),
+        ("{folder} -o {tmp}/out.exr --network resnet", ["network", "preset paper"]),
         ("{folder} -o {tmp}/out.exr --preset paper --channels 8,x", ["--channels", "integers such as"]),
         ("{folder} -o {tmp}/out.exr --map color", ["--map", "NAME=CHANNEL"]),
         ("{folder} -o {tmp}/out.exr --map beauty=x", ["beauty"]),
@@ -687,3 +687,24 @@ def test_ctrl_c_waits_for_an_import():
     with pytest.raises(KeyboardInterrupt):
         load()
     assert reached == ["the end"]
+
+
+def test_ctrl_c_that_is_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with held_interrupts():
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_what_the_fit_lacks_is_told_before_the_render(tmp_path, monkeypatch, capfd):
+    scene = tmp_path / "scene.json"
+    scene.write_text(json.dumps(SCENE))
+    monkeypatch.setattr("tungsten_dip.fit.oidn.find_spec", lambda name: None)
+    for option in (["--dip-pilot", "oidn"], ["--dip-device", "cuda"]):
+        assert tungsten.main(["--host", "mitsuba", "--dip-denoise", *option, str(scene)]) == 2
+        assert "expected an onnxruntime" in (told := capfd.readouterr().err) or "pip install" in told
+        assert "rendering:" not in told
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.json"]

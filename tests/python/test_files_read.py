@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image, write_image
+from tungsten_dip.buffers import Buffer, RenderBuffers, image_file, read_buffers, read_image, write_image
 from tungsten_dip.errors import InputError
 
 HEIGHT, WIDTH = 5, 7
@@ -574,3 +574,11 @@ def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> No
     (tmp_path / "a.png").rename(tmp_path / f"a{suffix}")
     with pytest.raises(InputError, match="no linear radiance"):
         read_image(tmp_path / f"a{suffix}")
+
+
+def test_layers_without_end_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_parts(tmp_path / "p.exr", **{f"layer{i}": {n: pixels(i) for n in "RGB"} for i in range(4)})
+    assert len(image_file.read_parts(tmp_path / "p.exr")) == 4
+    monkeypatch.setattr(image_file, "_MOST_BYTES", 3 * 3 * 4 * WIDTH * HEIGHT)
+    with pytest.raises(InputError, match="GiB of pixels, got more"):
+        image_file.read_parts(tmp_path / "p.exr")

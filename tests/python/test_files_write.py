@@ -439,3 +439,11 @@ def test_a_loop_of_links_cannot_be_written(tmp_path: Path) -> None:
     for attempt in (lambda: check_writable(path), lambda: write_image(path, noise((2, 2, 3)))):
         with pytest.raises(InputError, match="cannot be written"):
             attempt()
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".pfm", ".hdr", ".png"])
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 0), (4, 5, 2), (4, 5, 4), (0, 5, 3), (4, 0, 1)])
+def test_what_is_no_picture_is_refused(tmp_path: Path, suffix: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"expected a picture of shape \(height, width, 1 or 3\), got"):
+        write_image(tmp_path / f"a{suffix}", np.zeros(shape, np.float32))
+    assert not list(tmp_path.iterdir())

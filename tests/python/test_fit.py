@@ -585,6 +585,12 @@ def test_settings_out_of_range_are_refused(changes: dict[str, Any]) -> None:
         FitSettings(**changes)
 
 
+def test_settings_that_would_be_ignored_are_refused() -> None:
+    with pytest.raises(InputError, match="network: only the preset paper leaves that open"):
+        FitSettings("draft", network="resnet")
+    assert FitSettings("paper", network="resnet").network == "resnet"
+
+
 def test_settings_come_back_with_the_result(render: SyntheticRender) -> None:
     settings = _settings(iterations=1, seed=9)
     assert denoise(render.buffers, settings).settings == settings

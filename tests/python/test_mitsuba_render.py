@@ -7,15 +7,18 @@ import os
 import signal
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from tungsten_dip.buffers import read_buffers, write_denoised
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.hosts.mitsuba.render import render_translated
+from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.hosts.mitsuba.render import _Statistics, render_translated
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.scene.types import PathTracer
 
@@ -329,6 +332,21 @@ def test_result_depends_on_the_seed_alone() -> None:
     for a, b in zip(one, many, strict=True):
         np.testing.assert_array_equal(a, b)
     assert np.any(other.color.mean != one[0])
+
+
+def test_a_feature_that_one_ray_recorded_is_not_black_in_the_other_half() -> None:
+    one = np.ones((2, 2, 1), np.float32)
+    statistics = _Statistics(0.7 * one, 0 * one, one, 0 * one, 0 * one)
+    buffer = statistics.buffer(has_halves=True)
+    for plane in (buffer.mean, buffer.half_a, buffer.half_b):
+        np.testing.assert_allclose(plane, 0.7)
+
+
+def test_large_seeds_survive_an_exr(tmp_path: Path) -> None:
+    buffers = render_translated(ball((5, 4)), spp=2, seed=2**32 - 1, threads=1)
+    result = FitResult(buffers.color.mean, FitSettings(), 0.0, 0)
+    write_denoised(tmp_path / "a.exr", result, buffers)
+    assert read_buffers(tmp_path / "a.exr").attributes["seed"] == str(2**32 - 1)
 
 
 def test_pixels_have_random_numbers_of_their_own() -> None:

@@ -73,6 +73,17 @@ def test_brackets_in_a_pattern_with_numbers_are_plain(tmp_path):
     assert [frame.number for frame in find_frames(f"{tmp_path}/[a] #", "o#.exr")] == [1]
 
 
+def test_signs_in_a_folders_name_are_no_places_where_there_are_longer_ones(tmp_path):
+    for name in ("take#2", "50%done"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "f0007").mkdir()
+        (frame,) = find_frames(f"{tmp_path}/{name}/f####", f"out/{name}/f%04d.exr")
+        assert (frame.number, frame.input) == (7, tmp_path / name / "f0007")
+        assert str(frame.output) == f"out/{name}/f0007.exr"
+    (frame,) = find_frames(f"{tmp_path}/take#2/f####", "r####/f####.exr")
+    assert str(frame.output) == "r0007/f0007.exr"
+
+
 def test_frames_asked_for_need_not_exist(folders):
     frames = find_frames(f"{folders}/f####", "o####.exr", (1, 2))
     assert [frame.input.exists() for frame in frames] == [True, False]

@@ -222,7 +222,10 @@ def _oidn(bench_set: BenchSet, quality: Quality, threads: int | None) -> Method:
 
 def _nfor(bench_set: BenchSet, plan: Plan) -> Iterator[Method]:
     label, denoiser = "NFOR", plan.denoiser
-    if denoiser is not None:
+    color = bench_set.buffers.color
+    if denoiser is not None and (color.halves is None or color.variance is None):
+        _LOG.info("%s: the colour has no halves or no variance: NFOR is left out", bench_set.name)
+    elif denoiser is not None:
 
         def run(repeat: int, progress: Progress) -> list[Outcome]:
             start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Sums over a pixel's channels: numpy's own crawl along an axis of three."""
+"""The mean over a pixel's channels, written out: numpy's own crawls along an axis of three."""
 
 from __future__ import annotations
 

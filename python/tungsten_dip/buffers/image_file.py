@@ -32,6 +32,9 @@ RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
 MAX_PIXELS = 2**28
 """The largest image read: 16384 x 16384. One channel of it is 1 GiB of float32."""
 
+_MOST_BYTES = 16 << 30
+"""The most that all parts of a file may hold: zeros take a thousandth of it on disk."""
+
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
 # What the encoder decides anew, or what describes the encoding alone.
@@ -95,12 +98,18 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     """Write one picture of shape (height, width, 1 or 3), whole or not at all.
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
-    (clipped, 8 bit). Raises InputError if the suffix is another one or the file cannot be written.
+    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, or the file cannot be
+    written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (*RADIANCE_SUFFIXES, ".png"):
         raise InputError(f"{path}: expected a name that ends in {', '.join(RADIANCE_SUFFIXES)} or .png")
+    if image.ndim != 3 or image.shape[2] not in (1, 3) or image.size == 0:
+        raise InputError(
+            f"{path}: expected a picture of shape (height, width, 1 or 3), got {image.shape}; reshape it, or "
+            f"choose channels"
+        )
     if suffix == ".exr":
         names = "RGB" if image.shape[2] == 3 else "Y"
         channels = {name: image[..., index].astype(np.float32) for index, name in enumerate(names)}
@@ -146,7 +155,13 @@ def _decoded(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
     try:
         parts: list[Part] = []
+        size = 0
         while image.seek_subimage(len(parts), 0):
+            size += image.spec().image_bytes(True)
+            if size > _MOST_BYTES:
+                raise InputError(
+                    f"{path}: expected at most {_MOST_BYTES >> 30} GiB of pixels, got more; leave out layers"
+                )
             parts.append(_part(path, image, len(parts)))
     finally:
         image.close()

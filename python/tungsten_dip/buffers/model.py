@@ -34,7 +34,7 @@ FEATURES = ("albedo", "normal", "depth")
 """The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Buffer:
     """One quantity of an image: its mean over all samples and, where known, what is known of its noise.
 
@@ -65,7 +65,7 @@ class Buffer:
                 yield name, array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RenderBuffers:
     """Everything a renderer tells of one image.
 
@@ -119,10 +119,12 @@ class RenderBuffers:
 
 
 def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:
-    if array.shape != shape or array.dtype != np.float32:
+    if array.dtype != np.float32:
+        raise InputError(f"{what}: expected float32, got {array.dtype}; use .astype(np.float32)")
+    if array.shape != shape:
         raise InputError(
-            f"{what}: expected float32 of shape {shape} (height, width, channels) as the colour has it, got "
-            f"{array.dtype} of shape {array.shape}; render all buffers at one size"
+            f"{what}: expected shape {shape} (height, width, channels) as the colour has it, got "
+            f"{array.shape}; render all buffers at one size"
         )
     if not array.flags.c_contiguous:
         raise InputError(f"{what}: expected rows one after the other in memory; use np.ascontiguousarray")

@@ -10,8 +10,8 @@ from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 0.35), (5, 0.5), (5, 0.7))
 """Radius of the window, and standard deviations that pixels may differ by: what one pass leaves is compared
-with less noise by the next, which may look further and average more. One pass leaves what features of few
-samples show of lights' edges and mirrors as noisy as it is."""
+with less noise by the next, which may look further and average more. After
+one pass, features of few samples are still noisy at the edges of lights and in mirrors."""
 
 
 def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:

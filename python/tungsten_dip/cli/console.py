@@ -117,7 +117,9 @@ def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
     os.dup2(2, 1)
 
     def emit(value: dict[str, Any]) -> None:
-        os.write(stdout, (json.dumps(_finite(value), indent=1) + "\n").encode())
+        # A plain os.write may write a part, and say so in what it returns alone.
+        with os.fdopen(os.dup(stdout), "w", encoding="utf-8") as stream:
+            stream.write(json.dumps(_finite(value), indent=1) + "\n")
 
     try:
         yield emit

@@ -25,7 +25,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, FitSettings, require_torch
+from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.interrupts import held_interrupts
@@ -91,8 +91,6 @@ def _run(arguments: Sequence[str] | None) -> None:
         for name in (*FIT_OPTIONS, "report", "save_model", "warm_start", "dip_preview"):
             if getattr(options, name) not in (None, False):
                 raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
-    elif options.preset == "paper":
-        require_torch()
     for name in ("output_file", "hdr_output_file", "report", "save_model"):
         path, count = getattr(options, name), len(options.scenes)
         if path is not None and count > 1:
@@ -113,6 +111,8 @@ def _run(arguments: Sequence[str] | None) -> None:
 
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
+    if options.dip_denoise:
+        check_ready(settings, warm_start)
     follower = None
     if options.dip_denoise and len(options.scenes) > 1 and settings.preset != "paper":
         with held_interrupts():

@@ -151,11 +151,8 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
 
 def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     warm_start = load_warm_start(options)
-    fixed = [name for name in PAPER_SETTINGS if getattr(options, name) is not None]
     names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
     settings = fit_settings(options, names, warm_start)
-    if fixed and settings.preset != "paper":
-        raise InputError(f"--{fixed[0]}: only the preset paper leaves that open; add --preset paper")
     return _denoised(
         options, settings.preset, lambda buffers: denoise_with_progress(buffers, settings, warm_start)
     )

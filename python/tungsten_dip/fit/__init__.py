@@ -13,7 +13,7 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.candidates import checked_candidates, checked_previous
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.interrupts import held_interrupts
@@ -21,11 +21,29 @@ from tungsten_dip.progress import Progress, silent
 
 _LOG = logging.getLogger(__name__)
 
-__all__ = ["FitResult", "FitSettings", "HistoryPoint", "denoise", "require_torch"]
+__all__ = ["FitResult", "FitSettings", "HistoryPoint", "check_ready", "denoise", "require_torch"]
+
+
+def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
+    """Raise InputError if a package or device is missing, or other settings than ``warm_start``'s are asked.
+
+    Loads neither torch nor Open Image Denoise: a render may come before the fit.
+    """
+    if settings.preset == "paper":
+        require_torch()
+    else:
+        with held_interrupts():
+            from tungsten_dip.graphs.sessions import check_device
+
+        check_device(settings.device)
+        if settings.pilot == "oidn":
+            require_oidn()
+    if warm_start is not None:
+        check_settings(warm_start, settings)
 
 
 def require_torch() -> None:
-    """Raise InputError if torch is not installed, without importing it: a render may come before the fit."""
+    """Raise InputError if torch is not installed, without importing it."""
     if find_spec("torch") is None:
         raise InputError("preset paper needs torch; install it with: pip install 'tungsten-dip[fit]'")
 
@@ -71,10 +89,7 @@ def denoise(
         _LOG.warning(
             "the colour is NaN or Inf in every pixel: the picture will show next to nothing; render it again"
         )
-    if settings.preset == "paper":
-        require_torch()
-    elif settings.pilot == "oidn":
-        require_oidn()
+    check_ready(settings, warm_start)
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, settings.threads)

@@ -43,7 +43,7 @@ _BRIGHTEST = 1e15
 SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
 OUTLIER = 20.0
-"""A squared error this many times the local mean is an outlier: capped where it tells of a place's noise."""
+"""Squared errors are capped at so many times the local mean where they tell how noisy a place is."""
 
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7

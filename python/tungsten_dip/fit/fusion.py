@@ -18,7 +18,7 @@ import numpy as np
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
-from tungsten_dip.fit.model import Model, check_settings, source_sha256
+from tungsten_dip.fit.model import Model, source_sha256
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -32,7 +32,6 @@ from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.fit.training import start_of_training, train
-from tungsten_dip.graphs.sessions import check_device
 from tungsten_dip.progress import Progress, silent
 
 _LARGE_RADIUS = 18
@@ -69,10 +68,7 @@ def fit_fusion(
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
     started = time.perf_counter()
-    check_device(settings.device)
     preset = _PRESETS[settings.preset]
-    if warm_start is not None:
-        check_settings(warm_start, settings)
     if previous is not None:
         preset = _Preset(preset.following, preset.steps)
     pilots = preset.pilots

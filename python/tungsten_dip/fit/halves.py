@@ -12,7 +12,7 @@ T = TypeVar("T")
 def of_both_halves(work: Callable[[int], T], threads: int) -> tuple[T, T]:
     """Return ``work(0)`` and ``work(1)``, done side by side unless ``threads`` is 1.
 
-    For work that is numpy's in the main, which by itself keeps one core busy.
+    For work in numpy, which by itself keeps one core busy.
     """
     if threads == 1:
         return work(0), work(1)

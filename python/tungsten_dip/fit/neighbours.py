@@ -1,4 +1,4 @@
-"""What the pixels around a pixel say, without the pixel itself."""
+"""The mean of the pixels around a pixel, without the pixel itself."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuf
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.evidence import Evidence, exposure, unscaled
+from tungsten_dip.fit.lost_detail import with_what_was_lost
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
-from tungsten_dip.fit.yielding import with_what_was_lost
 
 _ERROR_RADIUS = 4
 _CHUNK_PIXELS = 1 << 18
@@ -23,7 +23,7 @@ _BIAS = 1.5
 """What the squared bias is to the median squared difference of the pilots from the result, about."""
 
 _CONFIDENCE = 4.0
-"""Standard errors above what the halves tell that an estimated error is believed."""
+"""An estimate may lie so many standard errors above what the halves tell."""
 
 _SURE = 0.35
 """Relative standard error of an estimated relMSE up to which it is believed."""

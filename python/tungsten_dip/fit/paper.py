@@ -19,7 +19,7 @@ from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.device import compute_device, convolution_dtype
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
-from tungsten_dip.fit.model import Model, Weights, check_planes, check_settings, source_sha256
+from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
 from tungsten_dip.fit.networks import ResNet, Skip
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
@@ -157,7 +157,6 @@ def fit_paper(
         raise InputError(f"expected at least one pixel, got {buffers.width}x{buffers.height}; render more")
     images = paper_images(buffers, settings)
     if warm_start is not None:
-        check_settings(warm_start, settings)
         check_planes(warm_start, images.planes)
     total = settings.iterations or ITERATIONS
     notes = [*_notes_on_method(buffers, settings), *images.notes]

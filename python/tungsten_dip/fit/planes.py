@@ -33,13 +33,13 @@ LARGEST_INPUT = 4.0
 # What the planes are made with is part of every saved network (`onnx.file` numbers the format): errors are
 # relative to the squared radiance, brightness is in units of the evidence.
 _LOG_OFFSET = 0.02
-"""Darker is as dark, to the logarithm of a brightness."""
+"""Added before a logarithm: brightnesses far below are not told apart."""
 
 _LEAST_ERROR = 1e-4
 """Smaller errors, 1% of the radiance, do not differ."""
 
 _LEAST_CAP = 1e-3
-"""Of the errors that count in full: where there is no noise, nothing is an outlier up to here."""
+"""Errors up to here are never capped as outliers."""
 
 _LARGEST_BRIGHTNESS = 2.0
 """Pilots more than e^2 times brighter than the reference, or darker, are as far off."""

@@ -67,11 +67,18 @@ class FitSettings:
             if value is not None and not (isinstance(value, Real) and float(value) > 0):
                 raise InputError(f"{name}: expected a number above 0, got {value!r:.40}")
         counts = self.channels
-        if not 0 < len(counts) <= _MOST_SCALES or not all(_is_whole(n, 1, _MOST_CHANNELS) for n in counts):
+        if (
+            not isinstance(counts, tuple)
+            or not 0 < len(counts) <= _MOST_SCALES
+            or not all(_is_whole(n, 1, _MOST_CHANNELS) for n in counts)
+        ):
             raise InputError(
                 f"channels: expected at most {_MOST_SCALES} counts from 1 to {_MOST_CHANNELS}, such as "
                 f"8,16,32,64,128, got {counts!r:.40}"
             )
+        for name in PAPER_SETTINGS:
+            if self.preset != "paper" and getattr(self, name) != getattr(type(self), name):
+                raise InputError(f"{name}: only the preset paper leaves that open; choose the preset paper")
 
 
 def _is_whole(value: object, least: int, most: int) -> bool:
@@ -87,7 +94,7 @@ class HistoryPoint:
     estimated_relmse: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FitResult:
     """A denoised image and what is known about it.
 

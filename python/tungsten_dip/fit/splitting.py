@@ -43,8 +43,7 @@ _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
 
 _UNEQUAL = 0.5
-"""Halves of one and two samples are so far apart from the mean of all three, in units of half their
-difference, with room to spare."""
+"""How far the mean may lie from (A + B) / 2, in units of |A - B| / 2: of one and two samples it is 1/3."""
 
 _ROUNDED = 2e-3
 """Relative difference that rounding to 16 bits explains."""

@@ -49,7 +49,7 @@ _PROBE_SHARE = 8
 """One pixel in this many at most is set aside."""
 
 _STRANGE = 0.5
-"""A network knows nothing of an image in which this part of a plane is as far out as inputs go."""
+"""A model knows nothing of an image of which this part of a plane is clipped at `LARGEST_INPUT`."""
 
 _WARM_RATE = 0.3
 """A network that starts near its goal takes steps this many times as long."""

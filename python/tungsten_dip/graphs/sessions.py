@@ -1,4 +1,4 @@
-"""Where onnxruntime computes."""
+"""Sessions of onnxruntime: the device, and the number of threads."""
 
 from __future__ import annotations
 

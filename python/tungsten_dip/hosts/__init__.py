@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,6 +14,9 @@ from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
 
 _log = logging.getLogger(__name__)
+
+_RENDERING = threading.Lock()
+"""Both hosts keep some of their state in globals of the process."""
 
 Host = Literal["auto", "tungsten", "mitsuba"]
 
@@ -28,7 +32,8 @@ def render(
     """Render a scene, given itself or its file, and return colour and features with independent halves.
 
     ``host`` "auto" is Tungsten where the package was built against it, else Mitsuba. None takes the scene's
-    ``spp``, and the host's own seed and number of threads. Writes no file.
+    ``spp``, and the host's own seed and number of threads. Writes no file. Of several threads one renders
+    at a time. Tungsten reads the file of a `Scene` itself, whatever was changed in memory.
 
     Raises InputError if the scene or the host cannot be used.
     """
@@ -41,9 +46,10 @@ def render(
         host = "tungsten" if tungsten.available() else "mitsuba"
     path = scene.path if isinstance(scene, Scene) else scene
     _log.info("%s: rendered by %s", path, host.capitalize())
-    if host == "tungsten":
-        # Which reads the file itself, and may know more than `load_scene`.
-        return tungsten.render(path, spp=spp, seed=seed, threads=threads, progress=progress)
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene)
-    return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)
+    with _RENDERING:
+        if host == "tungsten":
+            # Which may know more than `load_scene`.
+            return tungsten.render(path, spp=spp, seed=seed, threads=threads, progress=progress)
+        if not isinstance(scene, Scene):
+            scene = load_scene(scene)
+        return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)

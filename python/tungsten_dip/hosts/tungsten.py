@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -210,17 +210,19 @@ _INTERRUPTED = (130, -signal.SIGINT)
 def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) -> RenderBuffers:
     command = _require_executable()
     given = {name: value for name, value in asdict(options).items() if name in ("spp", "seed", "threads")}
-    read_end, write_end = os.pipe()
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        os.fdopen(read_end) as lines,
-        subprocess.Popen(
-            [command, "--dip-render-buffers", folder, str(write_end), str(scene), json.dumps(given)],
-            env=_environment(),
-            pass_fds=[write_end],
-        ) as child,
-    ):
-        os.close(write_end)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        read_end, write_end = os.pipe()
+        lines = stack.enter_context(os.fdopen(read_end))
+        with os.fdopen(write_end, "w"):
+            program = [
+                str(command),
+                "--dip-render-buffers",
+                folder,
+                str(write_end),
+                str(scene),
+                json.dumps(given),
+            ]
+            child = stack.enter_context(subprocess.Popen(program, env=_environment(), pass_fds=[write_end]))
         try:
             for line in lines:
                 fraction, _, message = line.rstrip("\n").partition(" ")
@@ -352,7 +354,7 @@ def _buffers(plan: Any, evidence: Evidence) -> RenderBuffers:
     attributes = {
         "renderer": f"Tungsten {_require_module().tungsten_version}",
         "integrator": plan.integrator,
-        "seed": plan.seed,
+        "seed": str(plan.seed),  # an EXR's whole numbers end at 2^31
     }
     buffers: dict[str, Any] = {name: Buffer(**known) for name, known in planes.items()}
     return RenderBuffers(**buffers, spp=spp, attributes=attributes)

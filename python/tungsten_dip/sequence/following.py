@@ -19,9 +19,9 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.model import Model, check_settings
+from tungsten_dip.fit import check_ready
+from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.graphs.sessions import check_device
 from tungsten_dip.onnx import inference
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
@@ -41,7 +41,7 @@ _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
 
 _CUT_ERROR = 5.0
-"""How many times the previous frame's error tells of a cut."""
+"""An error so many times the previous frame's means a cut."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,12 @@ class Follower:
         Raises InputError if the settings are those of the published method, which has no halves to follow,
         ask for another network than the first one's or a device that is not there, or refit is out of range.
         """
-        check_device(settings.device)
         if isinstance(refit, int) and refit:
             replace(settings, iterations=refit)  # which checks it
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models or Models()
-        if self.models.first is not None:
-            check_settings(self.models.first, settings)
+        check_ready(settings, self.models.first)
         self._settings = settings
         self._refit = refit
         self._last: _Last | None = None

@@ -9,7 +9,10 @@ from pathlib import Path
 
 from tungsten_dip.errors import InputError
 
-_NUMBER = re.compile(r"#+|%0?(\d*)d")
+_NUMBER = re.compile(r"##+|%0?(\d+)d")
+_ONE_SIGN = re.compile(r"#|%(\d*)d")
+"""Counts only where nothing longer does: folders may be called ``take#2`` or ``50%done``."""
+
 _MOST_FRAMES = 1_000_000
 
 
@@ -50,9 +53,9 @@ def find_frames(
 
     Raises InputError if a pattern has no place for a number, or nothing matches it.
     """
-    if not _NUMBER.search(outputs):
+    if not _places(outputs).search(outputs):
         raise InputError(f"{outputs}: expected a place for the frame's number, such as out/f####.exr")
-    if _NUMBER.search(inputs):
+    if _places(inputs).search(inputs):
         present = {number: Path(_named(inputs, number)) for number in numbers or ()}
         if numbers is None:
             present = _numbered(inputs)
@@ -70,8 +73,12 @@ def find_frames(
     return frames
 
 
+def _places(pattern: str) -> re.Pattern[str]:
+    return _NUMBER if _NUMBER.search(pattern) else _ONE_SIGN
+
+
 def _named(pattern: str, number: int) -> str:
-    return _NUMBER.sub(lambda match: f"{number:0{_digits(match)}d}", pattern)
+    return _places(pattern).sub(lambda match: f"{number:0{_digits(match)}d}", pattern)
 
 
 def _digits(match: re.Match[str]) -> int:
@@ -81,13 +88,21 @@ def _digits(match: re.Match[str]) -> int:
 def _numbered(pattern: str) -> dict[int, Path]:
     """Return the existing files whose name is the pattern's for some number."""
     pattern = str(Path(pattern))
-    digits = re.compile(_NUMBER.sub(r"(\\d+)", re.sub(r"([^\w#%/])", r"\\\1", pattern)))
+    places = _places(pattern)
+    between = [re.escape(text) for text in _between(places, pattern)]
+    digits = re.compile(r"(\d+)".join(between))
     found = {}
-    for path in _glob(_NUMBER.sub("*", glob.escape(pattern))):
+    for path in _glob("*".join(glob.escape(text) for text in _between(places, pattern))):
         match = digits.fullmatch(str(path))
         if match and _named(pattern, number := int(match[1])) == str(path):
             found[number] = path
     return found
+
+
+def _between(places: re.Pattern[str], pattern: str) -> list[str]:
+    """Return what stands before, between and after the places for a number."""
+    ends = [0, *(end for match in places.finditer(pattern) for end in match.span()), len(pattern)]
+    return [pattern[first:end] for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _globbed(pattern: str) -> dict[int, Path]:

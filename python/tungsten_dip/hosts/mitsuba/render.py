@@ -137,7 +137,7 @@ def render_translated(
         color=buffers.pop("color"),
         **buffers,  # type: ignore[arg-type]
         spp=float(done_spp),
-        attributes={"renderer": f"Mitsuba {VERSION}", "integrator": "path_tracer", "seed": seed},
+        attributes={"renderer": f"Mitsuba {VERSION}", "integrator": "path_tracer", "seed": str(seed)},
     )
 
 
@@ -222,7 +222,9 @@ class _Statistics:
         if not has_halves:
             return Buffer(self.mean)
         variance = self.squared_deviations / np.maximum(self.count * (self.count - 1), 1)
-        return Buffer(self.mean, self.half_a, self.half_b, variance)
+        # A feature that one ray alone recorded in a pixel, in fog say, is not black in the other half.
+        half_b = np.where(self.count_b > 0, self.half_b, self.half_a)
+        return Buffer(self.mean, self.half_a, half_b, variance)
 
 
 def _weighted_mean(a: FloatImage, weight_a: FloatImage, b: FloatImage, weight_b: FloatImage) -> FloatImage:

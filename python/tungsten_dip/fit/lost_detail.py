@@ -1,4 +1,4 @@
-"""Where the result yields to the noisy pixels: what they show otherwise, and both halves agree on, is true.
+"""Gives back detail that the fit has lost, where both halves agree on it.
 
 A noisy pixel far darker or brighter than the result is noise as a rule, but not where light has leaked over
 an edge that no feature shows, where a highlight was smoothed away, or where the network was fitted to another
@@ -23,7 +23,7 @@ _FEW = 6
 """Fewer pixels tell nothing of others: among heavy-tailed noise their standard error is too small."""
 
 _SURELY = 2.0
-"""Standard errors less than the other half tells that a difference is believed to be true."""
+"""So many standard errors are taken from a slope before it is believed."""
 
 _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""

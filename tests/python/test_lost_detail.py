@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tungsten_dip.fit.yielding import with_what_was_lost
+from tungsten_dip.fit.lost_detail import with_what_was_lost
 
 SHAPE = (40, 56, 3)
 
