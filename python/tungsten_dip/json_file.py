@@ -21,16 +21,19 @@ def object_from_json_file(path: Path) -> dict[str, Any]:
     Raises InputError, one line with the place, if the file cannot be read or holds no object.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig") if path.is_file() else None
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: expected JSON in UTF-8, got byte {error.start} that is not; re-save it"
-        ) from None
+        content = path.read_bytes() if path.is_file() else None
+        in_zip = any(parent.suffix.lower() == ".zip" and parent.is_file() for parent in path.parents)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); check the path and the permissions") from None
-    if text is None:
-        found = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{path}: expected a Tungsten scene file, found {found}; check the path")
+    if content is None:
+        found = "a zip on the way to it" if in_zip else "a folder" if path.is_dir() else "none"
+        remedy = "unpack it" if in_zip else "check the path"
+        raise InputError(f"{path}: expected a Tungsten scene file, found {found}; {remedy}")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # Tungsten takes any bytes for a name; as Latin-1 the same bytes are the same name.
+        text = content.decode("latin-1")
 
     repeated: set[str] = set()
 

@@ -351,6 +351,15 @@ def test_denoised_pictures_lie_beside_the_noisy_ones(tmp_path, renders, fits, ca
     assert capfd.readouterr().err.count("wrote ") == 6
 
 
+def test_pictures_of_unknown_types_are_written_as_known_ones(tmp_path, renders, caplog):
+    buffers = [{"type": "normal", "hdr_output_file": "n.tif"}]
+    scene = write_scene(
+        tmp_path / "scene.json", output_file="a.jpg", hdr_output_file="b", output_buffers=buffers
+    )
+    assert tungsten.main(["--host", "mitsuba", str(scene)]) == 0
+    assert {"a.png", "b.exr", "n.exr"} <= {path.name for path in tmp_path.iterdir()}
+
+
 def test_output_files_of_the_command_line(scene, tmp_path, renders, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()

@@ -16,6 +16,7 @@ mitsuba = pytest.importorskip("mitsuba", reason="the embedded host needs the pac
 
 import OpenImageIO  # noqa: E402
 
+from tungsten_dip.buffers import RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render as render_scene  # noqa: E402
@@ -479,23 +480,42 @@ def test_a_bitmap_of_several_bsdfs_is_loaded_once(folder: Path) -> None:
     assert all(albedo is albedos[0] for albedo in albedos)
 
 
-@pytest.mark.parametrize(
-    "primitive",
-    [
-        {**FLOOR, "bsdf": {"type": "rough_dielectric", "ior": 1.0}},
-        {
-            **FLOOR,
-            "ext_medium": {"type": "homogeneous", "phase_function": {"type": "henyey_greenstein", "g": 1}},
-        },
-    ],
-    ids=["ior", "g"],
-)
-def test_what_mitsuba_does_not_take_is_one_line(folder: Path, primitive: Json) -> None:
+def rendered(folder: Path, *primitives: Json, **camera: Any) -> RenderBuffers:
     path = folder / "scene.json"
-    camera = {"type": "pinhole", "resolution": [4, 4]}
-    path.write_text(json.dumps({"primitives": [primitive, WHITE_SKY], "camera": camera}))
+    camera = {"type": "pinhole", "resolution": [4, 4], **camera}
+    path.write_text(json.dumps({"primitives": [*primitives, WHITE_SKY], "camera": camera}))
+    return render_scene(load_scene(path), spp=1, threads=1)
+
+
+def test_glass_that_does_not_bend_shows_what_is_behind(folder: Path) -> None:
+    pane = {**FLOOR, "bsdf": {"type": "rough_dielectric", "ior": 1.0, "roughness": 0.01}}
+    through, free = rendered(folder, pane), rendered(folder)
+    np.testing.assert_allclose(through.color.mean, free.color.mean, rtol=0.05)
+    assert through.color.mean.mean() == pytest.approx(free.color.mean.mean(), rel=0.01)
+
+
+def test_matrices_rounded_by_hand(folder: Path) -> None:
+    turned = [0.707, 0, 0.707, -5, 0, 1, 0, 1, -0.707, 0, 0.707, -5, 0, 0, 0, 1]
+    wall = [0.866, 0.5, 0.001, 0, -0.5, 0.866, 0, 0, 0, 0, 1.2, 0, 0, 0, 0, 1]
+    assert np.isfinite(rendered(folder, {**FLOOR, "transform": wall}, transform=turned).color.mean).all()
+
+
+def test_a_sphere_without_one_axis_is_a_sphere(folder: Path) -> None:
+    flat, whole = (
+        rendered(
+            folder, {"type": "sphere", "transform": {"scale": scale, "position": [0, 0, 6]}, "bsdf": GREY}
+        )
+        for scale in ([1, 0, 1], 1)
+    )
+    assert whole.depth is not None
+    assert whole.depth.mean.any()
+    np.testing.assert_array_equal(flat.depth.mean, whole.depth.mean)
+
+
+def test_what_mitsuba_does_not_take_is_one_line(folder: Path) -> None:
+    endless = {"type": "homogeneous", "phase_function": {"type": "henyey_greenstein", "g": 1}}
     with pytest.raises(InputError, match=r"^Mitsuba cannot load the scene: [^\n]+$"):
-        render_scene(load_scene(path), spp=1, threads=1)
+        rendered(folder, {**FLOOR, "ext_medium": endless})
 
 
 def test_hair_without_absorption_makes_and_loses_no_light(folder: Path) -> None:

@@ -530,10 +530,31 @@ def test_a_mixture_that_doubles_with_every_name_is_refused(refused):
     assert "bsdfs[8]" in refused({"bsdfs": mixed})
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    (tmp_path / "scene.json").write_bytes(b'{"name": "\xff"}')
-    with pytest.raises(InputError, match="UTF-8"):
-        load_scene(tmp_path / "scene.json")
+def test_names_in_other_encodings_still_name(tmp_path):
+    scene = {
+        "bsdfs": [{"name": "Fu\xdfboden", "type": "mirror"}],
+        "primitives": [{"type": "quad", "bsdf": "Fu\xdfboden"}],
+        "camera": {"type": "pinhole"},
+    }
+    path = tmp_path / "scene.json"
+    path.write_bytes(json.dumps(scene, ensure_ascii=False).encode("latin-1"))
+    assert load_scene(path).primitives[0].bsdf.kind == "mirror"
+
+
+def test_a_scene_in_a_zip_says_what_to_do(tmp_path):
+    (tmp_path / "room.zip").write_bytes(b"PK")
+    with pytest.raises(InputError, match="a zip on the way to it; unpack it"):
+        load_scene(tmp_path / "room.zip" / "room" / "scene.json")
+
+
+def test_what_tungsten_takes_for_nothing(load):
+    scene = load({"media": None, "bsdfs": None, "camera": {"type": "pinhole"}})
+    assert scene.bsdfs == ()
+    # At (0, 0, 2), looking along +z.
+    np.testing.assert_array_equal(scene.camera.world_from_local[:3, 3], (0, 0, 2))
+    metals = [{"type": "conductor"}, {"type": "conductor", "k": 0.1}]
+    copper, same = load({"primitives": [{"type": "quad", "bsdf": bsdf} for bsdf in metals]}).primitives
+    assert same.bsdf.k == copper.bsdf.k
 
 
 @pytest.mark.parametrize("name", ["none.json", "", "a\0b.json"])

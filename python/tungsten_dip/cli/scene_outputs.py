@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,11 @@ from tungsten_dip.buffers import PLANES, Buffer, FloatImage, RenderBuffers, chec
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene
+
+_LOG = logging.getLogger(__name__)
+
+_LDR = (".png",)
+_HDR = RADIANCE_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -38,9 +44,9 @@ class SceneOutputs:
     def check(self) -> None:
         """Raise InputError if one of the files cannot be written."""
         for path in filter(None, [self.ldr, *(_path(buffer.ldr_output_file) for buffer in self.buffers)]):
-            check_writable(path, (".png",))
+            check_writable(path, _LDR)
         for path in filter(None, [self.hdr, *(_path(buffer.hdr_output_file) for buffer in self.buffers)]):
-            check_writable(path, RADIANCE_SUFFIXES)
+            check_writable(path, _HDR)
 
 
 def scene_outputs(
@@ -62,14 +68,25 @@ def scene_outputs(
     buffers = tuple(
         replace(
             buffer,
-            ldr_output_file=str(folder / buffer.ldr_output_file) if buffer.ldr_output_file else "",
-            hdr_output_file=str(folder / buffer.hdr_output_file) if buffer.hdr_output_file else "",
+            ldr_output_file=str(folder / name) if (name := _known(buffer.ldr_output_file, _LDR)) else "",
+            hdr_output_file=str(folder / name) if (name := _known(buffer.hdr_output_file, _HDR)) else "",
         )
         for buffer in renderer.output_buffers
     )
     return SceneOutputs(
-        ldr=placed(ldr, renderer.output_file), hdr=placed(hdr, renderer.hdr_output_file), buffers=buffers
+        ldr=placed(ldr, _known(renderer.output_file, _LDR)),
+        hdr=placed(hdr, _known(renderer.hdr_output_file, _HDR)),
+        buffers=buffers,
     )
+
+
+def _known(name: str, suffixes: tuple[str, ...]) -> str:
+    """Return a scene's name of a file, of another type where that cannot be written."""
+    if not Path(name).name or Path(name).suffix.lower() in suffixes:
+        return name
+    written = str(Path(name).with_suffix(suffixes[0]))
+    _LOG.warning("%s: expected a name that ends in %s; written as %s", name, " or ".join(suffixes), written)
+    return written
 
 
 def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) -> None:

@@ -242,6 +242,8 @@ class _Parser:
         return self.fields(annotation, value, where)
 
     def array(self, value: Any, where: str) -> list[Any]:
+        if value is None:
+            return []
         if not isinstance(value, list):
             raise self.fail(where, "an array", value, "put it in [ ]")
         return value
@@ -401,6 +403,9 @@ class _Parser:
                 remedy = f"use one of {', '.join(ETA_AND_K)}, or give eta and k"
                 raise self.fail(f"{where}.material", "the name of a material", parts["material"], remedy)
             parts["eta"], parts["k"] = ETA_AND_K[parts["material"]]
+        elif cls in (ConductorBsdf, RoughConductorBsdf, RoughWireBsdf) and "eta" not in parts:
+            # As in Tungsten, which reads both or none.
+            parts.pop("k", None)
         elif cls is Mesh and not parts.get("bsdf", True):
             raise self.fail(f"{where}.bsdf", "at least one BSDF", [], "name one")
         elif cls is Instances:

@@ -68,6 +68,14 @@ def default_camera_frame() -> Matrix:
     return matrix
 
 
+def default_pinhole_frame() -> Matrix:
+    """Return the frame of a pinhole that has no transform: the same, but at (0, 0, 2)."""
+    matrix = np.diag([-1.0, 1.0, 1.0, 1.0])
+    matrix[2, 3] = 2.0
+    matrix.flags.writeable = False
+    return matrix
+
+
 # --- Textures ---------------------------------------------------------------------------------------
 
 
@@ -765,6 +773,7 @@ class PinholeCamera(Camera):
     """Everything in focus. ``fov`` is horizontal."""
 
     kind: ClassVar[str] = "pinhole"
+    world_from_local: Transform = field(default_factory=default_pinhole_frame)
     fov: Fov = 60.0
 
 

@@ -185,10 +185,15 @@ def _dielectric(t: Translation, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
     return {"type": "dielectric", **_refraction(t, bsdf, uv)}
 
 
+_LEAST_BEND = 1e-4
+
+
 def _rough_dielectric(t: Translation, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
     if not bsdf.enable_refraction:
         return _reflecting_glass(t, bsdf, uv) | {"type": "roughconductor", **_microfacets(t, bsdf, uv)}
-    return {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
+    node = {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
+    # Mitsuba's has no half-vectors where nothing is bent, and refuses.
+    return node | {"int_ior": bsdf.ior if abs(bsdf.ior - 1) > _LEAST_BEND else 1 + _LEAST_BEND}
 
 
 def _reflecting_glass(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:

@@ -79,8 +79,11 @@ def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
 
 
 def _rigid(t: Translation, matrix: ts.Matrix) -> ts.Matrix:
-    """Return the matrix if it neither scales nor shears, cleaned of rounding."""
+    """Return the matrix if it neither scales nor shears, cleaned of rounding to two decimals or more."""
     axes = matrix[:3, :3]
-    if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4):
+    if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-2):
         raise t.unsupported("a scale in its transform")
-    return matrix
+    left, _, right = np.linalg.svd(axes)
+    rigid = matrix.copy()
+    rigid[:3, :3] = left @ right
+    return rigid

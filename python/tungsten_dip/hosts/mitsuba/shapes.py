@@ -135,7 +135,7 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
 def _quad(t: Translation, primitive: ts.Quad) -> Any:
     centre, (edge_x, _, edge_z) = primitive.world_from_local[:3, 3], primitive.world_from_local[:3, :3].T
     lengths = np.linalg.norm(edge_x), np.linalg.norm(edge_z)
-    if abs(edge_x @ edge_z) > 1e-4 * lengths[0] * lengths[1]:
+    if abs(edge_x @ edge_z) > 1e-2 * lengths[0] * lengths[1]:
         raise t.unsupported("a sheared quad")
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions = centre + (uv[:, :1] - 0.5) * edge_x + (uv[:, 1:] - 0.5) * edge_z
@@ -303,8 +303,11 @@ def _triangles(
 def _parts(t: Translation, matrix: Matrix) -> tuple[_Array, _Array, _Array]:
     """Return position, unit axes (as columns) and their lengths, as Tungsten takes a matrix apart."""
     scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    with np.errstate(invalid="ignore"):  # of an axis without length there is nothing to see
-        axes = matrix[:3, :3] / scale
+    known = scale > 0
+    axes = np.empty((3, 3))
+    axes[:, known] = matrix[:3, :3][:, known] / scale[known]
+    # An axis without length may point anywhere that the others do not.
+    axes[:, ~known] = np.linalg.svd(axes[:, known])[0][:, known.sum() :]
     if abs(axes.T @ axes - np.diag(np.diagonal(axes.T @ axes))).max() > 1e-3:
         raise t.unsupported("a sheared transform")
     return matrix[:3, 3], axes, scale

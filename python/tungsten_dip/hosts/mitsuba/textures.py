@@ -182,7 +182,7 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
         reason = " ".join(OpenImageIO.geterror().split())
         raise InputError(f"{texture.file}: expected an image for a texture ({reason}); check the file")
     pixels = image.read_image("float" if hdr else "uint8")
-    error = image.geterror()
+    error, alpha_channel = image.geterror(), image.spec().alpha_channel
     image.close()
     if pixels is None or error:
         raise InputError(
@@ -191,7 +191,7 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     pixels = np.asarray(pixels)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     channels = pixels.shape[2]
-    alpha: Any = pixels[:, :, -1:] if channels in (2, 4) else None
+    alpha: Any = pixels[:, :, alpha_channel : alpha_channel + 1] if alpha_channel >= 0 else None
     rgb: Any = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
     texels: Any
     if request == "rgb":
