@@ -27,6 +27,19 @@ struct Pixels {
     bool operator==(const Pixels&) const = default;
 };
 
+struct Size {
+    int height;
+    int width;
+};
+
+inline Pixels noise(Size size, int channels, unsigned seed, double sigma = 1) {
+    std::mt19937 generator(seed);  // NOLINT(misc-const-correctness): the distribution changes it
+    std::normal_distribution<double> normal(0, sigma);
+    Pixels image(size.height, size.width, channels);
+    for (float& value : image.values) value = static_cast<float>(normal(generator));
+    return image;
+}
+
 // What a renderer writes of a flat image of radiance 1 whose samples draw(generator) deviate from it.
 struct Render {
     Pixels mean, half_a, half_b, variance;

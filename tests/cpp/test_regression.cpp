@@ -4,7 +4,6 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
-#include <random>
 #include <stdexcept>
 #include <vector>
 
@@ -16,22 +15,10 @@ using namespace tungsten_dip;
 
 namespace {
 
-struct Size {
-    int height;
-    int width;
-};
 // Around one tile of 8x64 pixels, and far from it.
 constexpr std::array sizes{Size{.height = 1, .width = 1},  Size{.height = 1, .width = 65},
                            Size{.height = 9, .width = 1},  Size{.height = 7, .width = 5},
                            Size{.height = 8, .width = 64}, Size{.height = 9, .width = 130}};
-
-Pixels noise(Size size, int channels, unsigned seed, double sigma = 1) {
-    std::mt19937 generator(seed);  // NOLINT(misc-const-correctness): the distribution changes it
-    std::normal_distribution<double> normal(0, sigma);
-    Pixels image(size.height, size.width, channels);
-    for (float& value : image.values) value = static_cast<float>(normal(generator));
-    return image;
-}
 
 Pixels regressed(Pixels& target, Pixels& features, const RegressionWindow& window, int threads = 2) {
     const std::vector<float> penalty(static_cast<std::size_t>(features.channels), 0.1F);
