@@ -5,7 +5,8 @@
     tungsten-dip bench pareto FOLDER/*/noisy --methods presets,oidn
 
 writes two scene files for each: ``noisy.json`` renders buffers into ``noisy/``, ``reference.json`` the truth
-beside it. A Tungsten without OpenEXR needs ``--format pfm``.
+beside it. A Tungsten without OpenEXR needs ``--format pfm``, and the bench the names of the references then:
+``FOLDER/fur/noisy=FOLDER/fur/reference.pfm``.
 """
 
 import argparse

@@ -712,8 +712,9 @@ def test_what_the_fit_lacks_is_told_before_the_render(tmp_path, monkeypatch, cap
     scene = tmp_path / "scene.json"
     scene.write_text(json.dumps(SCENE))
     monkeypatch.setattr("tungsten_dip.fit.oidn.find_spec", lambda name: None)
-    for option in (["--dip-pilot", "oidn"], ["--dip-device", "cuda"]):
+    monkeypatch.setattr("onnxruntime.get_available_providers", list)
+    lacks = {("--dip-pilot", "oidn"): "needs pyoidn", ("--dip-device", "cuda"): "expected an onnxruntime"}
+    for option, told in lacks.items():
         assert tungsten.main(["--host", "mitsuba", "--dip-denoise", *option, str(scene)]) == 2
-        assert "expected an onnxruntime" in (told := capfd.readouterr().err) or "pip install" in told
-        assert "rendering:" not in told
+        assert told in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["scene.json"]

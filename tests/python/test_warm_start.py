@@ -188,6 +188,16 @@ def test_an_error_that_cannot_be_known_is_refused_before_the_work(
     assert not (tmp_path / "out.exr").exists()
 
 
+def test_another_preset_than_the_models_is_named(
+    tmp_path: Path, frame: SyntheticRender, capfd: pytest.CaptureFixture[str]
+) -> None:
+    save_model(tmp_path / "paper.onnx", paper_model("resnet", frame.buffers))
+    write_tungsten_folder(tmp_path / "in", frame.buffers)
+    fit = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out.exr"), "--preset", "draft"]
+    assert command.main([*fit, "--warm-start", str(tmp_path / "paper.onnx")]) == 2
+    assert "fitted with preset paper, this fit asks for draft" in capfd.readouterr().err
+
+
 def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:
     program = (
         "from tungsten_dip.fit.pointwise import training_step\n"

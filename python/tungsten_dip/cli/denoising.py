@@ -11,7 +11,7 @@ from typing import get_args, get_type_hints
 from tungsten_dip.buffers import RenderBuffers, replacing
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
 from tungsten_dip.interrupts import held_interrupts
 
@@ -48,6 +48,9 @@ def fit_settings(
     options: argparse.Namespace, names: Sequence[str], warm_start: Model | None = None
 ) -> FitSettings:
     """Return the settings (a model's, to start from it) with those of the named options that were given."""
+    if warm_start is not None and options.preset not in (None, warm_start.settings.preset):
+        # Told here: what else the model leaves open may be nothing that this preset knows.
+        check_settings(warm_start, FitSettings(options.preset))
     settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     given = {name: getattr(options, name) for name in names}
     return replace(settings, **{name: value for name, value in given.items() if value is not None})
