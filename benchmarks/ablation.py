@@ -47,7 +47,7 @@ VARIANTS: dict[str, Change] = {
     "no regression on the position": _without(lambda pilot: pilot.with_position),
     "no mean along edges as a pilot": _without(lambda pilot: pilot.along_edges),
     "no pilot that sees the colour alone": _without(lambda pilot: pilot.by_color),
-    "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 0.5),)),
+    "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 1, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         pilots, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),

@@ -117,10 +117,12 @@ HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_
 }
 
 py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_a, const py::array& half_b,
-                                   const OptionalArray& variance, int radius, float k, int threads) {
-    if (radius < 0 || !(k > 0)) {
-        throw py::value_error("expected a radius of at least 0 and k above 0, got " + std::to_string(radius) +
-                              " and " + std::to_string(k));
+                                   const OptionalArray& variance, int radius, int step, float k,
+                                   int threads) {
+    if (radius < 0 || step < 1 || radius % step != 0 || !(k > 0)) {
+        throw py::value_error(
+            "expected a radius that is a multiple of the step, no negative one, and k above 0, got " +
+            std::to_string(radius) + ", " + std::to_string(step) + " and " + std::to_string(k));
     }
     const Buffer in = buffer_from_arrays(mean, half_a, half_b, variance);
     const std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
@@ -128,7 +130,7 @@ py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_
     const Buffer out = buffer_from_arrays(planes[0], planes[1], planes[2], planes[3]);
     {
         const py::gil_scoped_release release;
-        prefilter_feature(in, out, {.radius = radius, .k = k}, threads);
+        prefilter_feature(in, out, {.radius = radius, .step = step, .k = k}, threads);
     }
     return py::make_tuple(planes[0], planes[1], planes[2], planes[3]);
 }
@@ -214,7 +216,7 @@ PYBIND11_MODULE(_core, module) {
                py::arg("variance"), py::arg("threads") = 0);
     module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),
                py::arg("half_b"), py::arg("variance"), py::kw_only(), py::arg("radius") = 5,
-               py::arg("k") = 0.5F, py::arg("threads") = 0);
+               py::arg("step") = 1, py::arg("k") = 0.5F, py::arg("threads") = 0);
     module.def("box_mean", &box_mean_array, py::arg("image"), py::arg("radius"), py::arg("threads") = 0);
     module.def("regress", &regress_arrays, py::arg("target"), py::arg("features"), py::arg("penalty"),
                py::arg("guide") = py::none(), py::arg("guide_variance") = py::none(), py::kw_only(),

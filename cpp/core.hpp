@@ -113,9 +113,11 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
 
 // --- prefilter.cpp
 
-// Where non-local means looks for pixels that are alike, and how many standard deviations apart those may be.
+// Where non-local means looks for pixels that are alike, in every `step`-th row and column up to `radius`
+// away, a multiple of it, and how many standard deviations apart those may be.
 struct SearchWindow {
     int radius = 5;
+    int step = 1;
     float k = 0.5F;
 };
 

@@ -133,8 +133,8 @@ class TileFilter {
           sums_(static_cast<std::size_t>(feature.a.channels() * tile_size)),
           weights_(tile_size),
           patch_rows_(padded_size) {
-        for (int dy = -window.radius; dy <= window.radius; ++dy) {
-            for (int dx = -window.radius; dx <= window.radius; ++dx) add_offset(dy, dx);
+        for (int dy = -window.radius; dy <= window.radius; dy += window.step) {
+            for (int dx = -window.radius; dx <= window.radius; dx += window.step) add_offset(dy, dx);
         }
     }
 

@@ -22,7 +22,7 @@ constexpr float tensor_sigma = 2.0F;
 constexpr int tensor_radius = 6;
 
 // Standard deviations beyond which neighbours are not looked at.
-constexpr float reach = 2.5F;
+constexpr float reach = 2.0F;
 
 constexpr float least_trace = 1e-12F;
 
@@ -131,9 +131,12 @@ struct TensorRow {
 };
 
 // What the Gaussians of some pixels in a row are made of: the unit vectors across the edges, 1 / (2 sigma^2)
-// along them, and the penalty of differences between tensors.
+// along them, and the penalty of differences between tensors. No weight further away than `columns` and
+// `rows` pixels counts.
 struct Gaussians {
     int count;
+    int columns = 0;
+    int rows = 0;
     std::array<float, block_width> normal_x{};
     std::array<float, block_width> normal_y{};
     std::array<float, block_width> along{};
@@ -141,6 +144,8 @@ struct Gaussians {
 
     // Where there is no single direction, as at corners, a Gaussian shrinks to the width that it has across.
     Gaussians(const TensorRow& tensor, int pixels, float along_sigma, float across_sigma) : count(pixels) {
+        float squared_columns = 0;
+        float squared_rows = 0;
         for (int x = 0; x < count; ++x) {
             const float xx = tensor.xx[x];
             const float yy = tensor.yy[x];
@@ -154,7 +159,15 @@ struct Gaussians {
             normal_y[i] = std::sin(angle);
             along[i] = 0.5F / (sigma * sigma);
             penalty[i] = other_edge_penalty / (trace * trace);
+            // Half the sides of the rectangle around the ellipse on which weights become negligible.
+            const float long_axis = 2 * negligible * sigma * sigma;
+            const float short_axis = 2 * negligible * across_sigma * across_sigma;
+            const float cosine = normal_x[i] * normal_x[i];
+            squared_columns = std::max(squared_columns, short_axis * cosine + long_axis * (1 - cosine));
+            squared_rows = std::max(squared_rows, short_axis * (1 - cosine) + long_axis * cosine);
         }
+        columns = static_cast<int>(std::ceil(std::sqrt(squared_columns)));
+        rows = static_cast<int>(std::ceil(std::sqrt(squared_rows)));
     }
 };
 
@@ -244,8 +257,10 @@ void smooth_along_edges(ConstImage image, ConstImage features, float along, floa
         std::array<float, block_width> weights{};
         // Of every channel, and of the weights.
         std::vector<std::array<float, block_width>> sums(static_cast<std::size_t>(image.channels) + 1);
-        for (int dy = -radius; dy <= radius; ++dy) {
-            for (int dx = -radius; dx <= radius; ++dx) {
+        const int rows = std::min(radius, gaussians.rows);
+        const int columns = std::min(radius, gaussians.columns);
+        for (int dy = -rows; dy <= rows; ++dy) {
+            for (int dx = -columns; dx <= columns; ++dx) {
                 const int near = measure_offset(gaussians, static_cast<float>(dx), static_cast<float>(dy),
                                                 across, weights.data());
                 if (near == 0) continue;

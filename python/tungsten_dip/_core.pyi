@@ -62,6 +62,7 @@ def prefilter_feature(
     variance: FloatImage | None,
     *,
     radius: int = 5,
+    step: int = 1,
     k: float = 0.5,
     threads: int = 0,
 ) -> tuple[FloatImage, FloatImage, FloatImage, FloatImage]:

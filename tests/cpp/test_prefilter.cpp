@@ -54,8 +54,8 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
     };
     double sum = 0;
     double weights = 0;
-    for (int dy = -window.radius; dy <= window.radius; ++dy) {
-        for (int dx = -window.radius; dx <= window.radius; ++dx) {
+    for (int dy = -window.radius; dy <= window.radius; dy += window.step) {
+        for (int dx = -window.radius; dx <= window.radius; dx += window.step) {
             if (!inside(y + dy, x + dx)) continue;
             double distance = 0;
             for (int py = y - 3; py <= y + 3; ++py) {
@@ -81,7 +81,8 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
 void agrees_with_the_definition() {
     for (const auto& [height, width] :
          {std::pair{13, 11}, std::pair{70, 67}, std::pair{1, 9}, std::pair{9, 1}}) {
-        for (const SearchWindow window : {SearchWindow{}, SearchWindow{.radius = 2, .k = 0.9F}}) {
+        for (const SearchWindow window :
+             {SearchWindow{}, SearchWindow{.radius = 2, .k = 0.9F}, SearchWindow{.radius = 6, .step = 3}}) {
             Render render = noisy_edge(height, width, 1);
             Output out(render, 2, true, window);
             double worst = 0;

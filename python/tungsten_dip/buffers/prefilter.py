@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-_PASSES = ((3, 0.35), (5, 0.5), (5, 0.7))
-"""Radius of the window, and standard deviations that pixels may differ by: what one pass leaves is compared
-with less noise by the next, which may look further and average more. After
-one pass, features of few samples are still noisy at the edges of lights and in mirrors."""
+_PASSES = ((3, 1, 0.35), (4, 2, 0.5), (4, 1, 0.7))
+"""Radius and step of the window, and standard deviations that pixels may differ by: what one pass leaves is
+compared with less noise by the next, which may look further and average more. After one pass, features of
+few samples are still noisy at the edges of lights and in mirrors."""
 
 
-def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:
+def prefilter_features(
+    buffers: RenderBuffers,
+    threads: int | None = None,
+    passes: Sequence[tuple[int, int, float]] | None = None,
+) -> RenderBuffers:
     """Return buffers whose features are filtered by non-local means, each half with the other's weights.
 
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
@@ -22,6 +28,7 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A
     feature without halves is filtered with weights of its own, by the noise that its second differences
     tell. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
+    ``passes`` are radius, step and standard deviations of each, None those that guides of a regression need.
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
@@ -30,9 +37,16 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
             mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
             if feature.halves is None:
                 variance = noise_in(mean, thread_count(threads))
-            for radius, k in _PASSES:
+            for radius, step, k in passes or _PASSES:
                 mean, half_a, half_b, variance = _core.prefilter_feature(
-                    mean, half_a, half_b, variance, radius=radius, k=k, threads=thread_count(threads)
+                    mean,
+                    half_a,
+                    half_b,
+                    variance,
+                    radius=radius,
+                    step=step,
+                    k=k,
+                    threads=thread_count(threads),
                 )
             if name != "normal":
                 # Where negative values were mended, the mean is not that of the halves, and may fall below 0.
