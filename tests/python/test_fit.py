@@ -617,6 +617,23 @@ def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
     assert error(result.color, bottom) < 0.5 * error(buffers.color.mean, bottom)
 
 
+def test_empty_space_stays_black_whatever_the_previous_frame_shows(render):
+    buffers = render.buffers
+    empty = np.zeros(buffers.color.mean.shape[:2], bool)
+    empty[:20, :20] = True
+
+    color, depth = buffers.color, buffers.depth
+    assert color.halves is not None
+    assert depth is not None
+    a, b = (np.where(empty[:, :, None], np.float32(0), half) for half in color.halves)
+    nothing = np.where(empty[:, :, None], np.float32(0), depth.mean)
+    buffers = replace(buffers, color=Buffer((a + b) / 2, a, b), depth=Buffer(nothing))
+    bright = np.full_like(render.reference, 2.0)
+    result = denoise(buffers, FitSettings(preset="draft", threads=1), previous=(bright, bright))
+    assert not result.color[:17, :17].any()
+    assert result.color[~empty].any()
+
+
 def test_a_previous_frame_of_another_size_is_refused(render):
     wrong = np.zeros((3, 4, 3), np.float32)
     with pytest.raises(InputError, match="previous, half A: expected shape"):

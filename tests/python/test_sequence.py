@@ -110,7 +110,7 @@ def test_patterns_that_name_no_frames_are_refused(folders, inputs, outputs, matc
 def test_what_is_moved_is_what_the_camera_sees(tmp_path):
     before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.5))
     truth = before.reference, 2 * before.reference
-    moved_a, moved_b = reproject(truth, before.buffers, before.camera, now.buffers, now.camera)
+    moved_a, moved_b = reproject(truth, before.buffers, before.camera, now.buffers, now.camera, threads=2)
     seen = np.isfinite(moved_a[:, :, 0])
     assert seen.mean() > 0.85
     still = np.abs(before.reference - now.reference)[seen]
@@ -130,17 +130,37 @@ def test_what_is_moved_to_a_half_takes_nothing_of_the_albedo_from_the_other(tmp_
 
     def moved(half_b):
         buffers = now.buffers.with_quantities(albedo=Buffer(albedo, albedo, half_b))
-        return reproject(truth, before.buffers, before.camera, buffers, now.camera)
+        return reproject(truth, before.buffers, before.camera, buffers, now.camera, threads=2)
 
     (a, b), (a_now, b_now) = moved(albedo), moved(albedo * np.float32(1.25))
     np.testing.assert_array_equal(a, a_now)
     assert np.nanmax(np.abs(b - b_now)) > 0.02
 
 
+def test_dark_surfaces_beside_black_ones_are_not_lit_up(tmp_path):
+    """Only the light on a surface is divided by its albedo: black ones must not take it for their own."""
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    color = np.full_like(frame.reference, 0.01)
+
+    def with_albedo(value):
+        return frame.buffers.with_quantities(albedo=Buffer(np.full_like(color, value)))
+
+    for before, now in ((0.002, 0.0), (0.0, 0.002)):
+        moved, _ = reproject(
+            (color, color), with_albedo(before), frame.camera, with_albedo(now), frame.camera, threads=2
+        )
+        np.testing.assert_allclose(moved, 0.01, rtol=0.2)
+
+
 def test_a_camera_that_stands_still_moves_nothing(tmp_path):
     frame = true_frame(tmp_path, 0.1, seed=0)
     moved, _ = reproject(
-        (frame.reference, frame.reference), frame.buffers, frame.camera, frame.buffers, frame.camera
+        (frame.reference, frame.reference),
+        frame.buffers,
+        frame.camera,
+        frame.buffers,
+        frame.camera,
+        threads=2,
     )
     np.testing.assert_allclose(moved, frame.reference, rtol=1e-3)
 
@@ -150,7 +170,12 @@ def test_the_sky_moves_with_its_direction(tmp_path):
     sky = now.buffers.depth.mean[:, :, 0] == 0
     assert sky.any()
     moved, _ = reproject(
-        (before.reference, before.reference), before.buffers, before.camera, now.buffers, now.camera
+        (before.reference, before.reference),
+        before.buffers,
+        before.camera,
+        now.buffers,
+        now.camera,
+        threads=1,
     )
     assert np.isfinite(moved[sky]).all(axis=1).mean() > 0.8
     np.testing.assert_allclose(moved[sky & np.isfinite(moved[:, :, 0])], 0.2, rtol=1e-3)
@@ -163,7 +188,7 @@ def test_another_surface_is_rejected(tmp_path, quantity):
     changed[10:16, 20:30] = changed[10:16, 20:30] * np.float32(1.5) + np.float32(0.5)
     buffers = frame.buffers.with_quantities(**{quantity: Buffer(changed)})
     moved, _ = reproject(
-        (frame.reference, frame.reference), buffers, frame.camera, frame.buffers, frame.camera
+        (frame.reference, frame.reference), buffers, frame.camera, frame.buffers, frame.camera, threads=2
     )
     assert np.isnan(moved[11:15, 21:29]).all()
     assert np.isfinite(moved[:9]).all()
@@ -178,6 +203,7 @@ def test_what_lies_behind_the_previous_camera_is_not_seen(tmp_path):
         replace(frame.camera, world_from_local=turned),
         frame.buffers,
         frame.camera,
+        threads=2,
     )
     assert np.isnan(moved).all()
 

@@ -181,14 +181,15 @@ def evidence_from_buffers(
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
     filled = None
+    something = _something(halves, buffers)
     if previous is None:
         guides = first_guides(halves, guidance)
     else:
         moved = scaled(previous[0], scale), scaled(previous[1], scale)
         guides, first, filled = following_guides(halves, moved, guidance)
-        computed[FOLLOWING_PILOTS[0]] = first
+        computed[FOLLOWING_PILOTS[0]] = first[0] * something, first[1] * something
+        filled = filled[0] * something, filled[1] * something
     maker = PilotMaker(halves, guidance, guides, previous=filled)
-    something = _something(halves, buffers)
     for index, pilot in enumerate(described):
         progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE

@@ -40,7 +40,8 @@ _LARGE_RADIUS = 18
 
 _BATCH_PIXELS = 1 << 14
 _SMALL_BATCH_PIXELS = 1 << 13
-"""Enough for the pilots of draft; with more of them the rims of lamps, few pixels, come out worse."""
+"""Enough for the pilots of draft, and beside a previous frame; with more of them the rims of lamps, few
+pixels, come out worse."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def fit_fusion(
     started = time.perf_counter()
     preset = _PRESETS[settings.preset]
     if previous is not None:
-        preset = _Preset(preset.following, preset.steps)
+        preset = _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS)
     pilots = preset.pilots
     # One model of first order cannot stand for a whole image.
     largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)

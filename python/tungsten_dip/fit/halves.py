@@ -1,4 +1,4 @@
-"""Work on both halves of the samples at the same time."""
+"""Work on two halves, of the samples or of a picture, at the same time."""
 
 from __future__ import annotations
 

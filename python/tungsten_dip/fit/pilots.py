@@ -103,11 +103,12 @@ FINAL_PILOTS = (
 )
 
 # Enough beside what the previous frame shows. The first stands where that shows nothing.
-FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES)
+FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(8, step=4, with_position=True))
 FOLLOWING_PILOTS = (
-    *FOLLOWING_DRAFT_PILOTS,
-    Pilot(4, k=1.0),
-    Pilot(6, k=2.0, step=2),
+    Pilot(1),
+    EDGES,
+    Pilot(12, step=3, with_position=True),
+    Pilot(6, k=2.0, step=3),
     Pilot(4, k=1.0, by_color=True),
 )
 

@@ -48,6 +48,9 @@ _UNEQUAL = 0.5
 _ROUNDED = 2e-3
 """Relative difference that rounding to 16 bits explains."""
 
+_ENOUGH_PIXELS = 1 << 14
+"""Of an image, for the medians that tell whether halves belong to it."""
+
 
 def with_independent_halves(
     buffers: RenderBuffers, candidates: tuple[Halves, ...], seed: int, threads: int | None
@@ -109,9 +112,12 @@ def _sum_of_squares(image: FloatImage) -> _Plane:
 
 def _belong(color: Buffer) -> bool:
     """Whether the colour is the mean of its halves, but for rounding and for halves of unequal size."""
-    a, b = (half.astype(np.float64) for half in color.halves_or_mean)
-    apart = np.median(abs((a + b) / 2 - color.mean))
-    noise, level = np.median(abs(a - b) / 2), np.median(abs(color.mean))
+    step = -(-color.mean[:, :, 0].size // _ENOUGH_PIXELS)
+    mean, a, b = (
+        image.reshape(-1, 3)[::step].astype(np.float64) for image in (color.mean, *color.halves_or_mean)
+    )
+    apart = np.median(abs((a + b) / 2 - mean))
+    noise, level = np.median(abs(a - b) / 2), np.median(abs(mean))
     return bool(apart <= _UNEQUAL * noise + _ROUNDED * level)
 
 

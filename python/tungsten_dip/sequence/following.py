@@ -18,6 +18,7 @@ from tungsten_dip import fit
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.model import Model
@@ -33,12 +34,12 @@ _LOG = logging.getLogger(__name__)
 Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
-_FIRST_FOLLOWING_STEPS = 120
-"""Of the network for frames that follow: it has few pilots, and its task is close to the next frame's."""
-
 _MOST_STEPS = 240
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
+
+_ALBEDO_PASSES = ((3, 1, 0.5),)
+"""Of the pre-filter, enough to tell surfaces apart and to part light from them."""
 
 _CUT_ERROR = 5.0
 """An error so many times the previous frame's means a cut."""
@@ -120,7 +121,9 @@ class Follower:
 
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
         alone = buffers.with_quantities(normal=None, depth=None)
-        return buffers.with_quantities(albedo=prefilter_features(alone, self._settings.threads).albedo)
+        return buffers.with_quantities(
+            albedo=prefilter_features(alone, self._settings.threads, _ALBEDO_PASSES).albedo
+        )
 
     def _follow(
         self, buffers: RenderBuffers, smooth: RenderBuffers, camera: Camera | None, progress: Progress
@@ -132,7 +135,7 @@ class Follower:
         last = self._last
         if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
             raise _CutError("the previous frame had another size")
-        moved = None if last is None else _moved(last, smooth, camera)
+        moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
         model = self.models.first if moved is None else self.models.following
@@ -150,7 +153,7 @@ class Follower:
                     raise  # The model was made for something else.
                 raise _CutError(str(problem)) from problem
         elif moved is not None:
-            settings = replace(self._settings, iterations=_FIRST_FOLLOWING_STEPS)
+            settings = replace(self._settings, iterations=_MOST_STEPS)
             result = fit.denoise(buffers, settings, progress, previous=moved)
         else:
             return None
@@ -171,13 +174,13 @@ class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
 
 
-def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None) -> Halves | None:
+def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int | None) -> Halves | None:
     """Return what the last frame shows of this one, None where that cannot be told."""
     if camera is None or last.camera is None or last.result.halves is None:
         return None
     if buffers.depth is None or last.buffers.depth is None:
         return None
-    return reproject(last.result.halves, last.smooth, last.camera, buffers, camera)
+    return reproject(last.result.halves, last.smooth, last.camera, buffers, camera, thread_count(threads))
 
 
 def _typical_error(result: FitResult) -> float | None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.pilots import divisor
+from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
 
 _DEPTH_TOLERANCE = 0.02
@@ -25,6 +25,10 @@ _DEPTH_TOLERANCE = 0.02
 _NORMAL_TOLERANCE = 0.2
 _ALBEDO_TOLERANCE = 0.1
 """Of the larger of 1 and the albedo (a light's is its radiance)."""
+
+_LEAST_ALBEDO = np.float32(0.02)
+"""Added to the albedos that light is moved without, on black surfaces too: what one frame divides by another
+number than the next one multiplies by would light up at their edges."""
 
 _LEAST_WEIGHT = 0.25
 """Of the four pixels around a point, in total; less is the rim of a surface."""
@@ -51,6 +55,7 @@ def reproject(
     previous_camera: Camera,
     current: RenderBuffers,
     camera: Camera,
+    threads: int,
 ) -> Halves:
     """Move the previous frame's halves (linear radiance, shape (height, width, 3)) to the current frame.
 
@@ -60,25 +65,31 @@ def reproject(
     assert current.depth is not None
     shape = current.color.mean.shape
     depth = current.depth.mean[:, :, 0]
-    column, row, distance = _seen_from(previous_camera, _points(camera, depth), depth > 0)
+    points = _points(camera, depth)
     # Light is moved without the albedo, which the current frame knows more sharply. Of that, each half takes
     # its own: errors that it shared with the half which scores it would pass for truth.
     images = [
         (half / albedo).reshape(-1, 3) for half, albedo in zip(halves, _divisors(previous), strict=True)
     ]
-    moved = [np.zeros((depth.size, 3), np.float32) for _ in halves]
-    total = np.zeros(depth.size, np.float32)
-    for index, weight in _neighbours(column, row, shape[0], shape[1]):
-        weight = weight * _same_surface(previous, index, current, distance)
-        total += weight
-        for sums, image in zip(moved, images, strict=True):
-            sums += weight[:, None] * image[index]
-    total[total < _LEAST_WEIGHT] = np.nan
-    moved_a, moved_b = (
-        (sums / total[:, None]).reshape(shape) * albedo
-        for sums, albedo in zip(moved, _divisors(current), strict=True)
-    )
-    return moved_a, moved_b
+    moved_a, moved_b = (np.zeros((depth.size, 3), np.float32) for _ in halves)
+    middle = depth.size // 2
+
+    def move(part: slice) -> None:
+        column, row, distance = _seen_from(previous_camera, points, depth > 0, part)
+        sums = moved_a[part], moved_b[part]
+        total = np.zeros(len(distance), np.float32)
+        for index, weight in _neighbours(column, row, shape[0], shape[1]):
+            weight = weight * _same_surface(previous, index, current, part, distance)
+            total += weight
+            for sum_of_half, image in zip(sums, images, strict=True):
+                sum_of_half += weight[:, None] * image[index]
+        total[total < _LEAST_WEIGHT] = np.nan
+        for sum_of_half in sums:
+            sum_of_half /= total[:, None]
+
+    of_both_halves(lambda lower: move(slice(middle, None) if lower else slice(middle)), threads)
+    albedo_a, albedo_b = _divisors(current)
+    return moved_a.reshape(shape) * albedo_a, moved_b.reshape(shape) * albedo_b
 
 
 def _points(camera: Camera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -96,23 +107,24 @@ def _points(camera: Camera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _seen_from(
-    camera: Camera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_]
+    camera: Camera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_], part: slice
 ) -> tuple[FloatArray, ...]:
     """Return where a camera sees points, in pixels (far outside if behind it), and how far from it they are.
 
-    Arrays are flat. The distance of the sky is 0.
+    Arrays are flat, of a part of the flat image. The distance of the sky is 0.
     """
-    origin, way = points
     height, width = hit.shape
+    origin, way = points[0], points[1].reshape(-1, 3)[part]
+    hit = hit.ravel()[part]
     position = np.asarray(camera.world_from_local, np.float64)[:3, 3]
     offset = (origin - position).astype(np.float32)
-    local = (way + hit[:, :, None] * offset).reshape(-1, 3) @ _rotation(camera).astype(np.float32)
+    local = (way + hit[:, None] * offset) @ _rotation(camera).astype(np.float32)
     x, y, z = local.T
     before = z > 0
     scale = np.where(before, _plane_distance(camera) / np.where(before, z, 1), np.nan) * np.float32(width / 2)
     column = np.where(before, x * scale + width / 2 - _pixel_center(camera), -2 * width)
     row = np.where(before, height / 2 - y * scale - _pixel_center(camera), -2 * height)
-    return column, row, np.where(hit.ravel(), np.sqrt(np.einsum("ij,ij->i", local, local)), 0)
+    return column, row, np.where(hit, np.sqrt(np.einsum("ij,ij->i", local, local)), 0)
 
 
 def _neighbours(
@@ -132,7 +144,11 @@ def _neighbours(
 
 
 def _same_surface(
-    previous: RenderBuffers, index: npt.NDArray[np.intp], current: RenderBuffers, distance: FloatArray
+    previous: RenderBuffers,
+    index: npt.NDArray[np.intp],
+    current: RenderBuffers,
+    part: slice,
+    distance: FloatArray,
 ) -> npt.NDArray[np.bool_]:
     assert previous.depth is not None
     found = previous.depth.mean.ravel()[index]
@@ -143,7 +159,7 @@ def _same_surface(
         before, now = getattr(previous, name), getattr(current, name)
         if before is None or now is None:
             continue
-        values = now.mean.reshape(-1, 3)
+        values = now.mean.reshape(-1, 3)[part]
         difference = np.abs(before.mean.reshape(-1, 3)[index] - values)
         same &= _largest(difference) <= tolerance * np.maximum(1, _largest(values))
     return same
@@ -156,11 +172,11 @@ def _largest(values: FloatArray) -> FloatArray:
 
 
 def _divisors(buffers: RenderBuffers) -> tuple[FloatImage | np.float32, ...]:
-    """Return what divides the colour of each half."""
+    """Return what divides the colour of each half, so that light is left."""
     albedo = buffers.albedo
     if albedo is None:
         return np.float32(1), np.float32(1)
-    return tuple(divisor(image) for image in albedo.halves_or_mean)
+    return tuple(image + _LEAST_ALBEDO for image in albedo.halves_or_mean)
 
 
 def _rotation(camera: Camera) -> npt.NDArray[np.float64]:
