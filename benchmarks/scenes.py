@@ -6,11 +6,16 @@
 
 writes two scene files for each: ``noisy.json`` renders buffers into ``noisy/``, ``reference.json`` the truth
 beside it. A Tungsten without OpenEXR needs ``--format pfm``, and the bench the names of the references then:
-``FOLDER/fur/noisy=FOLDER/fur/reference.pfm``.
+``FOLDER/fur/noisy=FOLDER/fur/reference.pfm``. With ``--frames 4`` the camera moves around each scene:
+``noisy-0000.json``, ``reference-0000.json`` and so on, for
+
+    cd FOLDER/fur && tungsten-dip sequence 'noisy-####' -o '####.exr' --cameras 'noisy-####.json'
+    python benchmarks/frames.py 'FOLDER/fur/reference-####.exr' 'FOLDER/fur/####.exr'
 """
 
 import argparse
 import json
+import math
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +28,8 @@ Json = dict[str, Any]
 Vector = Sequence[float]
 
 RESOLUTION = (512, 288)
+DEGREES_PER_FRAME = 2.5
+RISE_PER_FRAME = 0.02
 
 
 def surface(kind: str, bsdf: str, at: Vector, scale: Vector | float = 1, turned: Vector = (0, 0, 0)) -> Json:
@@ -351,6 +358,21 @@ def with_output(scene: Json, spp: int, output: Json) -> Json:
     }
 
 
+def moved_on(camera: Json, frame: int) -> Json:
+    """Return the camera as it stands at a frame: further around what it looks at, and higher."""
+    if frame == 0:
+        return camera
+    (x, y, z), (center_x, _, center_z) = camera["transform"]["position"], camera["transform"]["look_at"]
+    x, z = x - center_x, z - center_z
+    angle = math.radians(DEGREES_PER_FRAME * frame)
+    position = (
+        center_x + x * math.cos(angle) + z * math.sin(angle),
+        y + RISE_PER_FRAME * frame,
+        center_z - x * math.sin(angle) + z * math.cos(angle),
+    )
+    return {**camera, "transform": {**camera["transform"], "position": position}}
+
+
 def main() -> None:
     """Write every scene."""
     parser = argparse.ArgumentParser(
@@ -360,24 +382,33 @@ def main() -> None:
     parser.add_argument(
         "--format", default="exr", choices=["exr", "pfm"], help="of the images that are rendered"
     )
+    parser.add_argument("--frames", type=int, default=1, help="of a camera that moves (default: 1)")
     options = parser.parse_args()
     for name, (make, spp, reference_spp) in SCENES.items():
         folder = options.folder / name
-        (folder / "noisy").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         scene = make(folder)
-        planes = {"sample_variance": True, "two_buffer_variance": True}
-        buffers = [
-            {"type": each, "hdr_output_file": f"noisy/{each}.{options.format}", **planes}
-            for each in ("color", "albedo", "normal", "depth")
-        ]
-        outputs = {
-            "noisy": with_output(scene, spp, {"output_buffers": buffers}),
-            "reference": with_output(
-                scene, reference_spp, {"hdr_output_file": f"reference.{options.format}"}
-            ),
-        }
-        for which, whole in outputs.items():
-            (folder / f"{which}.json").write_text(json.dumps(whole, indent=1))
+        for frame in range(options.frames):
+            number = f"-{frame:04d}" if options.frames > 1 else ""
+            seen = {**scene, "camera": moved_on(scene["camera"], frame)}
+            write_frame(folder, number, seen, (spp, reference_spp), options.format)
+
+
+def write_frame(folder: Path, number: str, scene: Json, spp: tuple[int, int], image_format: str) -> None:
+    """Write the scene files of the noisy buffers and of the reference."""
+    (folder / f"noisy{number}").mkdir(exist_ok=True)
+    planes = {"sample_variance": True, "two_buffer_variance": True}
+    buffers = [
+        {"type": each, "hdr_output_file": f"noisy{number}/{each}.{image_format}", **planes}
+        for each in ("color", "albedo", "normal", "depth")
+    ]
+    outputs: dict[str, Json] = {
+        "noisy": {"output_buffers": buffers},
+        "reference": {"hdr_output_file": f"reference{number}.{image_format}"},
+    }
+    for samples, (which, output) in zip(spp, outputs.items(), strict=True):
+        whole = with_output(scene, samples, output)
+        (folder / f"{which}{number}.json").write_text(json.dumps(whole, indent=1))
 
 
 if __name__ == "__main__":
