@@ -10,7 +10,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-_PASSES = ((3, 1, 0.35), (4, 2, 0.5), (4, 1, 0.7))
+_PASSES = ((3, 1, 0.35), (4, 2, 0.5), (5, 1, 0.7))
 """Radius and step of the window, and standard deviations that pixels may differ by: what one pass leaves is
 compared with less noise by the next, which may look further and average more. After one pass, features of
 few samples are still noisy at the edges of lights and in mirrors."""
