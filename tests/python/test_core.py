@@ -306,3 +306,10 @@ def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
         _core.smooth_along_edges(image, image[:3].copy(), along=3, across=0.3)
     with pytest.raises(ValueError, match="above 0"):
         _core.smooth_along_edges(image, image, along=0, across=0.3)
+
+
+@pytest.mark.parametrize("window", [{"radius": -1}, {"radius": 5, "step": 2}, {"step": 0}, {"k": 0.0}])
+def test_a_window_that_cannot_be_searched_is_refused(window):
+    image = np.ones((4, 5, 3), np.float32)
+    with pytest.raises(ValueError, match="expected a radius that is a multiple of the step"):
+        _core.prefilter_feature(image, image, image, None, **window)
