@@ -30,6 +30,8 @@ from tungsten_dip.buffers import (
     write_image,
     write_tungsten_folder,
 )
+from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings
 
@@ -146,6 +148,37 @@ def test_everything_of_the_input_passes_through_bit_for_bit(tmp_path: Path) -> N
     write_denoised(tmp_path / "out.exr", result, again)  # onto its own input
     assert load(tmp_path / "out.exr")[0][1].keys() == written.keys()
     assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+
+
+def test_the_pictures_place_is_that_of_the_colours_part(tmp_path: Path) -> None:
+    display = {"displayWindow": ((0, 0), (9, 9))}
+    window = {"dataWindow": ((5, 7), (7, 8)), **display}
+    pixels = {channel: noise((2, 3), 1) for channel in "RGB"}
+    other = {"id": noise((4, 4), 2)}
+    encoded = [
+        OpenEXR.Part({"type": OpenEXR.scanlineimage, **display}, other, "mattes"),
+        OpenEXR.Part({"type": OpenEXR.scanlineimage, "samplesPerPixel": 64, **window}, pixels, "color"),
+    ]
+    OpenEXR.File(encoded).write(str(tmp_path / "in.exr"))
+    buffers = read_buffers(tmp_path / "in.exr")
+    assert buffers.spp == 64
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    for _ in range(2):
+        (_, channels, header), (mattes, _, _), _ = load(tmp_path / "out.exr")
+        assert channels["R"].shape == (2, 3)
+        assert np.array_equal(header["dataWindow"], window["dataWindow"])
+        assert mattes == "mattes"
+        again = read_buffers(tmp_path / "out.exr")
+        assert again.spp == 64
+        write_denoised(tmp_path / "out.exr", result_for(again), again)
+
+
+def test_what_openexr_cannot_write_is_one_line(tmp_path: Path) -> None:
+    part = Part({"R": noise((2, 3), 1)}, {"dataWindow": ((0, 0), (7, 7))})
+    with pytest.raises(InputError, match=r"out\.exr: cannot be written \(") as caught:
+        write_exr(tmp_path / "out.exr", [part])
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_parts_pass_through(tmp_path: Path) -> None:

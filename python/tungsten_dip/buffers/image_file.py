@@ -80,7 +80,11 @@ def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> 
         temporary.open("wb") as stream,
         _compressing(thread_count(threads)),
     ):
-        OpenEXR.File(encoded).write(stream)
+        try:
+            OpenEXR.File(encoded).write(stream)
+        except (RuntimeError, ValueError) as error:
+            reason = _one_line(str(error))
+            raise InputError(f"{path}: cannot be written ({reason}); leave out what does not fit") from error
 
 
 @contextmanager

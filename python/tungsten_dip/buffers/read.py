@@ -208,6 +208,8 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         raise InputError(f"{path}: {error}") from None
     groups = dict(found.channels)
     main, _ = owner[groups["color"][0]]
+    color_part = next(index for index, part in enumerate(source.parts) if part is main)
+    attributes = {**attributes, **main.attributes}
     planes: dict[str, FloatImage] = {}
     for key, names in groups.items():
         channels = []
@@ -240,7 +242,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         spp=planes.get("spp", spp),
         alpha=planes.get("alpha"),
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
-        source=source,
+        source=replace(source, color_part=color_part),
     )
 
 

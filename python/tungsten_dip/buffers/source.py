@@ -51,7 +51,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Source:
-    """The parts of an input file, and the --map that told its layers apart."""
+    """The parts of an input file, the --map that told its layers apart, and which part holds the colour."""
 
     parts: tuple[Part, ...]
     mapping: Mapping[str, str] = field(default_factory=dict)
+    color_part: int = 0

@@ -158,7 +158,8 @@ def _source_from_buffers(buffers: RenderBuffers) -> Source:
 
 
 def _frame(source: Source) -> dict[str, Any]:
-    return {key: value for key, value in source.parts[0].attributes.items() if key in FRAME}
+    attributes = source.parts[source.color_part].attributes
+    return {key: value for key, value in attributes.items() if key in FRAME}
 
 
 def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
