@@ -106,6 +106,10 @@ def test_references_of_another_size_or_broken_are_refused(folder, bench_set):
     write_image(path, np.full_like(bench_set.reference, np.nan))
     with pytest.raises(InputError, match="finite reference"):
         read_sets([str(folder)])
+    write_image(path, bench_set.reference)
+    write_image(folder / "nfor.exr", bench_set.reference[1:])
+    with pytest.raises(InputError, match=r"nfor\.exr: expected the size"):
+        read_sets([str(folder)])
 
 
 @pytest.mark.parametrize("what", ["pareto", "paper"])

@@ -7,7 +7,7 @@ import pytest
 from browser import assert_page_works
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
-from tungsten_dip.report.page import _round_ticks, report_page
+from tungsten_dip.report.page import _features, _round_ticks, report_page
 from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, error_in_false_color, side_by_side
 
 VOID = {"meta", "img", "input", "line", "circle", "polyline", "link", "br"}
@@ -127,6 +127,15 @@ def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
     page = Page(report_page("small", small.buffers, fitted, "reinhard"))
     assert "all+random" in page.text
     assert not re.search(r"\bnan\b", page.text)
+
+
+def test_the_depth_of_the_sky_does_not_hide_the_rest(make_render):
+    render = make_render(8, 8)
+    depth = np.full((8, 8, 1), 2, np.float32)
+    depth[:4] = 1e10
+    (picture,) = _features(RenderBuffers(Buffer(render.reference), depth=Buffer(depth)))
+    assert picture.pixels[0, 0, 0] == 0
+    assert picture.pixels[7, 0, 0] == 1
 
 
 def test_side_by_side_keeps_both_pictures():

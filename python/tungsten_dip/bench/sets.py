@@ -40,8 +40,8 @@ def read_sets(texts: Sequence[str]) -> list[BenchSet]:
     ``INPUT`` is whatever `read_buffers` takes. Where no reference is named, it is the file ``reference.exr``
     in the folder of the buffers or the folder above.
 
-    Raises InputError if a file cannot be read, there is no reference, its size is another one, or two sets
-    have one name.
+    Raises InputError if a file cannot be read, there is no reference, its size or that of NFOR's image is
+    another one, or two sets have one name.
     """
     sets = [_read_set(text) for text in texts]
     names = [each.name for each in sets]
@@ -86,18 +86,24 @@ def cropped(buffers: RenderBuffers, part: tuple[slice, slice]) -> RenderBuffers:
 def _read_set(text: str) -> BenchSet:
     path, reference_path = _paths(text)
     buffers, reference = read_buffers(path), read_image(reference_path)
-    if reference.shape != buffers.color.mean.shape:
-        raise InputError(
-            f"{reference_path}: expected the size of {path}, {buffers.width} x {buffers.height} with 3 "
-            f"channels, got {reference.shape[1]} x {reference.shape[0]} with {reference.shape[2]}"
-        )
+    _check_size(reference_path, reference, path, buffers)
     if not np.isfinite(reference).all():
         raise InputError(f"{reference_path}: expected a finite reference, got NaN or Inf; render it anew")
     nfor_path = _folder(path) / NFOR
     nfor = read_image(nfor_path) if nfor_path.exists() else None
+    if nfor is not None:
+        _check_size(nfor_path, nfor, path, buffers)
     resolved = path.resolve()
     name = "/".join((resolved.parent.name, resolved.stem)).lstrip("/")
     return _bench_set(name, buffers, reference, nfor)
+
+
+def _check_size(image_path: Path, image: FloatImage, path: Path, buffers: RenderBuffers) -> None:
+    if image.shape != buffers.color.mean.shape:
+        raise InputError(
+            f"{image_path}: expected the size of {path}, {buffers.width} x {buffers.height} with 3 channels, "
+            f"got {image.shape[1]} x {image.shape[0]} with {image.shape[2]}"
+        )
 
 
 def _bench_set(name: str, buffers: RenderBuffers, reference: FloatImage, nfor: FloatImage | None) -> BenchSet:

@@ -19,6 +19,9 @@ CURVE_WIDTH, CURVE_HEIGHT = 720, 260
 CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 90, 24, 20, 56
 """Size of the plot and its margins in the units of the SVG."""
 
+_SKY_DEPTH = 1e9
+"""The same as in `buffers.sanitize`."""
+
 
 def report_page(
     title: str, buffers: RenderBuffers, result: FitResult, tonemap: str, remarks: Sequence[str] = ()
@@ -51,7 +54,10 @@ def report_page(
 
 
 def _features(buffers: RenderBuffers) -> Iterator[Picture]:
-    """Yield the means of the features: normals as (n + 1) / 2, depth divided by its 99th percentile."""
+    """Yield the means of the features: normals as (n + 1) / 2, depth divided by its 99th percentile.
+
+    The depth of the sky, which other renderers mark by a large number, is 0 as in Tungsten's.
+    """
     for name, buffer in buffers.quantities():
         values = np.nan_to_num(buffer.mean)
         if name == "color":
@@ -61,6 +67,7 @@ def _features(buffers: RenderBuffers) -> Iterator[Picture]:
         elif name == "normal":
             values = np.float32(0.5) * (values + 1)
         elif name == "depth":
+            values = np.where(values < _SKY_DEPTH, values, np.float32(0))
             values = values / (np.percentile(values, 99) or 1)
         yield Picture(name, _in_range(values))
 

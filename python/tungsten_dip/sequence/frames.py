@@ -124,4 +124,7 @@ def _globbed(pattern: str) -> dict[int, Path]:
 
 def _glob(pattern: str) -> list[Path]:
     path = Path(pattern)
-    return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+    try:
+        return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+    except ValueError as error:  # of ** beside other signs, in Python 3.11 and 3.12
+        raise InputError(f"{pattern}: is no pattern for files ({error}); use f####, f%04d or f*") from error
