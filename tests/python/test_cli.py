@@ -388,12 +388,12 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     ]
     finished = tungsten_dip.fit.denoise
 
-    def interrupted(buffers, settings, progress):
+    def interrupted(buffers, settings, progress, warm_start=None, previous=None):
         if fits:
             raise KeyboardInterrupt
         return finished(buffers, settings, progress)
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", interrupted)
+    monkeypatch.setattr("tungsten_dip.sequence.following.fit_fusion", interrupted)
     assert tungsten.main(["--dip-denoise", *map(str, scenes)]) == 130
     names = {path.name for path in tmp_path.iterdir()} - {path.name for path in scenes}
     assert names == {
@@ -606,6 +606,40 @@ def test_a_name_that_is_no_text_is_refused_in_a_line(tmp_path, render, capfd):
     _, errors = capfd.readouterr()
     assert "expected a name in UTF-8; rename it" in errors
     assert len(errors.splitlines()) == 1
+
+
+def test_results_with_a_name_that_is_no_text_are_told(folder, tmp_path):
+    picture = tmp_path / os.fsdecode(b"bad\xff.exr")
+    options = ["denoise", str(folder), "-o", str(picture), "--preset", "draft", "--iterations", "2"]
+    program = [sys.executable, "-c", MAIN.format("tungsten_dip"), *options]
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run(program, capture_output=True, check=False, env=environment)
+    assert done.returncode == 0
+    assert b"bad\\udcff.exr: 2 iterations" in done.stdout
+    assert picture.exists()
+
+
+def test_ctrl_c_in_the_fit_of_a_preview_ends_the_render(tmp_path, fits, render, monkeypatch):
+    finished = tungsten_dip.fit.denoise
+    monkeypatch.setattr(
+        "tungsten_dip.fit.denoise",
+        lambda *given, **more: replace(finished(*given, **more), interrupted=True),
+    )
+    outputs = tungsten.SceneOutputs(tmp_path / "room.png", tmp_path / "room.exr")
+    preview = tungsten._preview(outputs, FitSettings())
+    with pytest.raises(KeyboardInterrupt):
+        preview(tungsten.tungsten_host.Rendered(render.buffers, None, None, "gamma"))
+    assert (tmp_path / "room_preview.png").exists()
+
+
+def test_an_error_map_is_written_where_no_network_was_fitted(tmp_path, render, capfd):
+    clean = Buffer(render.reference, render.reference, render.reference * np.float32(1.0001))
+    write_tungsten_folder(tmp_path / "clean", RenderBuffers(clean))
+    files = [str(tmp_path / name) for name in ("out.exr", "error.exr", "model.onnx")]
+    options = ["-o", files[0], "--error-map", files[1], "--save-model", files[2]]
+    assert command.main(["denoise", str(tmp_path / "clean"), *options]) == 2
+    assert "no network was fitted" in capfd.readouterr().err
+    assert [Path(file).exists() for file in files] == [True, True, False]
 
 
 def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkeypatch):

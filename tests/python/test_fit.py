@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from dataclasses import replace
+from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender, SyntheticRender
-from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
@@ -589,6 +590,19 @@ def test_settings_that_would_be_ignored_are_refused() -> None:
     with pytest.raises(InputError, match="network: only the preset paper leaves that open"):
         FitSettings("draft", network="resnet")
     assert FitSettings("paper", network="resnet").network == "resnet"
+
+
+def test_numbers_of_numpy_are_settings_as_well(render: SyntheticRender, tmp_path: Path) -> None:
+    settings = FitSettings(
+        "draft", iterations=np.int32(2), seed=np.int64(3), target_error=np.float32(0.5), threads=np.int8(1)
+    )
+    assert [type(value) for value in (settings.iterations, settings.seed, settings.target_error)] == [
+        int,
+        int,
+        float,
+    ]
+    write_denoised(tmp_path / "out.exr", denoise(render.buffers, settings), render.buffers)
+    assert FitSettings("paper", channels=(np.int64(8), np.int64(16))).channels == (8, 16)
 
 
 def test_settings_come_back_with_the_result(render: SyntheticRender) -> None:

@@ -97,6 +97,7 @@ def test_frames_asked_for_need_not_exist(folders):
         ("nothing####", "o####.exr", "no such frames"),
         ("no*", "o####.exr", "no such frames"),
         ("?0001", "o####.exr", "both are frame 1"),
+        ("nothing**", "o####.exr", "is no pattern for files|no such frames"),
     ],
 )
 def test_patterns_that_name_no_frames_are_refused(folders, inputs, outputs, match):
@@ -364,15 +365,49 @@ def test_frames_without_halves_follow_too(tmp_path):
     assert errors[2] < errors[0]
 
 
+def test_frames_that_lose_a_feature_follow_again_after_one_full_fit(tmp_path):
+    follower = Follower(replace(DRAFT, iterations=20))
+    how = []
+    for n in range(5):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        buffers = frame.buffers if n < 2 else frame.buffers.with_quantities(normal=None)
+        how.append(follower.denoise(buffers, frame.camera).how)
+    assert how == ["fitted", "followed", "cut", "followed", "followed"]
+
+
+def test_flicker_is_not_told_by_halves_that_are_copies(tmp_path):
+    follower = Follower(replace(DRAFT, iterations=5))
+    for n in range(2):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        mean = frame.buffers.color.mean
+        copies = frame.buffers.with_quantities(color=Buffer(mean, mean, mean))
+        followed = follower.denoise(copies, frame.camera)
+        assert followed.result.halves_drawn
+        assert followed.flicker is None
+
+
+def test_cameras_without_depth_are_told_once(tmp_path, caplog):
+    follower = Follower(replace(DRAFT, iterations=5))
+    for n in range(2):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        follower.denoise(frame.buffers.with_quantities(depth=None), frame.camera)
+    assert caplog.text.count("no depth: frames cannot be moved by their cameras") == 1
+
+
 def test_the_published_method_is_refused():
     with pytest.raises(InputError, match="preset paper"):
         Follower(FitSettings(preset="paper"))
 
 
-def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path):
+@pytest.mark.filterwarnings("ignore:Specified provider")
+def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="iterations: expected a whole number"):
         Follower(DRAFT, 2_000_000_000)
     if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
+        with pytest.raises(InputError, match="device cuda"):
+            Follower(replace(DRAFT, device="cuda"))
+        both = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+        monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: both)
         with pytest.raises(InputError, match="device cuda"):
             Follower(replace(DRAFT, device="cuda"))
     frame = true_frame(tmp_path, 0.0, seed=0)

@@ -98,6 +98,25 @@ def test_other_threads_are_no_reason_to_do_it_again(frames):
     assert outputs(frames) == before
 
 
+def test_a_result_never_takes_the_place_of_an_input(frames, capsys):
+    before = {path: path.read_bytes() for path in Path("noisy").rglob("*.exr")}
+    for output in ("noisy/f####/color.exr", "./noisy/f####/albedoB.exr"):
+        assert main([*arguments()[:2], "-o", output, "--preset", "draft"]) == 2
+        assert "is one of the buffers that are read" in capsys.readouterr().err
+    # Another frame's input is an input as well.
+    color = frames / "noisy/f0000/color.exr"
+    color.symlink_to(color.rename(frames / "color2.exr"))
+    assert main([*arguments()[:2], "-o", "color#.exr", "--preset", "draft", "--frames", "0-2"]) == 2
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_flicker_is_that_against_the_frame_before(frames, capfd):
+    (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
+    assert main(arguments("--json")) == 2
+    known = {record["number"]: record["flicker"] is not None for record in told(capfd)["frames"]}
+    assert known == {0: False, 1: False, 2: False, 3: True}
+
+
 def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
     (frames / "cameras/f0002.json").unlink()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -64,6 +64,13 @@ def load_warm_start(options: argparse.Namespace) -> Model | None:
         from tungsten_dip.onnx import load_model  # imports ONNX
 
     return load_model(options.warm_start)
+
+
+def check_no_input(outputs: Iterable[Path | None], inputs: Collection[Path]) -> None:
+    """Raise InputError if one of the outputs, where they are named, is among the resolved inputs."""
+    for path in outputs:
+        if path is not None and path.resolve() in inputs:
+            raise InputError(f"{path}: is one of the buffers that are read; name another file")
 
 
 def denoise_with_progress(

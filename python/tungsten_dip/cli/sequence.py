@@ -6,17 +6,19 @@ import argparse
 import hashlib
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.buffers import check_writable, replacing
+from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.console import add_json, add_threads, progress_on_stderr
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     add_file_options,
     add_fit_options,
+    check_no_input,
     fit_settings,
     load_warm_start,
 )
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from argparse import _SubParsersAction
 
     from tungsten_dip.sequence.following import Models
+    from tungsten_dip.sequence.frames import Frame
     from tungsten_dip.sequence.work import Record
 
 log = logging.getLogger(__name__)
@@ -77,6 +80,8 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         )
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
+    with _without_repetition():
+        check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
     frames[0].output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(frames[0].output)
     if options.report is not None:
@@ -111,6 +116,13 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     skipped = sum(record.skipped for record in records)
     before = f"; {skipped} were finished before" if skipped else ""
     return facts, f"{len(done)} frames, denoised in {seconds:.1f} s in all{before}"
+
+
+def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[Path]:
+    """Yield what is read of all frames; of those that cannot be read the run itself tells."""
+    for frame in frames:
+        with suppress(InputError):
+            yield from (file.resolve() for file in input_files(frame.input, mapping))
 
 
 @contextmanager

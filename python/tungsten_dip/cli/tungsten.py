@@ -72,10 +72,11 @@ def denoise_outputs(
     write_image(pair, side_by_side(noisy, denoised))
     if report is not None:
         write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
+    for written in filter(None, (exr, png, pair, report)):
+        log.info("wrote %s", written)
     if save_model is not None:
         write_model(save_model, result)
-    for written in filter(None, (exr, png, pair, report, save_model)):
-        log.info("wrote %s", written)
+        log.info("wrote %s", save_model)
     if result.interrupted:
         raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
 
@@ -256,8 +257,9 @@ def _last_written(path: Path | None) -> int | None:
 
 def _follow(follower: Follower, camera: Camera, buffers: RenderBuffers) -> FitResult:
     """Denoise a frame, starting from the one before."""
-    # A camera that frames cannot be moved with is none.
     known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
+    if known is None:
+        log.info("frames of this camera cannot be moved into place, and do not help one another")
     with progress_on_stderr("denoising") as progress:
         return follower.denoise(buffers, known, progress).result
 
@@ -272,6 +274,8 @@ def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten
         result = denoise_with_progress(rendered.buffers, draft)
         write_image(path, display_from_radiance(result.color, rendered.tonemap))
         log.info("wrote %s", path)
+        if result.interrupted:
+            raise KeyboardInterrupt  # which was meant for the render
 
     return write
 

@@ -36,6 +36,7 @@ from tungsten_dip.cli.denoising import (
     REPORT_HELP,
     add_file_options,
     add_fit_options,
+    check_no_input,
     denoise_with_progress,
     fit_settings,
     load_warm_start,
@@ -184,11 +185,9 @@ def _denoised(
         raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 
     inputs = [file.resolve() for file in input_files(options.input, dict(options.map))]
-    for path in (options.output, options.error_map):
-        # One file that holds everything may be replaced: the result passes all of its layers through.
-        is_whole = path is options.output and inputs == [options.input.resolve()]
-        if path is not None and path.resolve() in inputs and not is_whole:
-            raise InputError(f"{path}: is one of the buffers that are read; name another file")
+    # One file that holds everything may be replaced: the result passes all of its layers through.
+    is_whole = inputs == [options.input.resolve()]
+    check_no_input([options.error_map] if is_whole else [options.output, options.error_map], inputs)
 
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, dict(options.map))
@@ -196,11 +195,11 @@ def _denoised(
     write_denoised(options.output, result, buffers, half=options.half)
     if options.report is not None:
         write_report(options.report, options.input.name, buffers, result, TONEMAP, remarks)
-    if options.save_model is not None:
-        write_model(options.save_model, result)
     if options.error_map is not None:
         assert result.error is not None
         write_image(options.error_map, result.error)
+    if options.save_model is not None:
+        write_model(options.save_model, result)
 
     facts = {
         "output": str(options.output),

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
-import numpy as np
-
 from tungsten_dip.buffers.model import Halves, RenderBuffers
-from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.oidn import require_oidn
+from tungsten_dip.fit.preparation import prepared, with_notes
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
-
-_LOG = logging.getLogger(__name__)
 
 __all__ = ["FitResult", "FitSettings", "HistoryPoint", "check_ready", "denoise", "require_torch"]
 
@@ -27,10 +21,15 @@ __all__ = ["FitResult", "FitSettings", "HistoryPoint", "check_ready", "denoise",
 def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
     """Raise InputError if a package or device is missing, or other settings than ``warm_start``'s are asked.
 
-    Loads neither torch nor Open Image Denoise: a render may come before the fit.
+    Loads neither Open Image Denoise nor, but for a GPU, torch: a render may come before the fit.
     """
     if settings.preset == "paper":
         require_torch()
+        if settings.device == "cuda":
+            with held_interrupts():
+                from tungsten_dip.fit.device import check_torch_device
+
+            check_torch_device(settings.device)
     else:
         with held_interrupts():
             from tungsten_dip.graphs.sessions import check_device
@@ -83,29 +82,18 @@ def denoise(
     """
     if settings is None:
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
-    if buffers.color.mean.size == 0:
-        raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
-    if not any(np.isfinite(plane).any() for _, plane in buffers.color.planes()):
-        _LOG.warning(
-            "the colour is NaN or Inf in every pixel: the picture will show next to nothing; render it again"
-        )
     check_ready(settings, warm_start)
-    given = checked_candidates(buffers, candidates)
-    previous = checked_previous(buffers, previous)
-    buffers, mended = sanitize(buffers, settings.threads)
+    known = prepared(buffers, candidates, previous, settings.threads)
     if settings.preset == "paper":
-        if given or previous is not None:
+        if known.candidates or known.previous is not None:
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
         with held_interrupts():
             from tungsten_dip.fit.paper import fit_paper
 
-        result = fit_paper(buffers, settings, progress, warm_start)
+        result = fit_paper(known.buffers, settings, progress, warm_start)
     else:
         with held_interrupts():
             from tungsten_dip.fit.fusion import fit_fusion
 
-        result = fit_fusion(buffers, settings, progress, given, warm_start, previous)
-    result = replace(result, notes=(*mended, *result.notes))
-    for note in result.notes:
-        _LOG.info(note)
-    return result
+        result = fit_fusion(known.buffers, settings, progress, known.candidates, warm_start, known.previous)
+    return with_notes(result, known.notes)

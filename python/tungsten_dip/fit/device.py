@@ -12,14 +12,19 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 
 
+def check_torch_device(device: str) -> None:
+    """Raise InputError if torch cannot compute there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("device cuda: expected one that torch can use, found none; use cpu or auto")
+
+
 @contextmanager
 def compute_device(settings: FitSettings) -> Iterator[torch.device]:
     """Yield the device that the settings ask for, with their number of threads set meanwhile.
 
     Raises InputError if the device is not there.
     """
-    if settings.device == "cuda" and not torch.cuda.is_available():
-        raise InputError("device cuda: expected one that torch can use, found none; use cpu or auto")
+    check_torch_device(settings.device)
     use_cuda = settings.device != "cpu" and torch.cuda.is_available()
     threads_before = torch.get_num_threads()
     torch.set_num_threads(thread_count(settings.threads))

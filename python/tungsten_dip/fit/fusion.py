@@ -87,6 +87,7 @@ def fit_fusion(
     buffers, candidates, notes = with_independent_halves(
         buffers, tuple(candidates), settings.seed, settings.threads
     )
+    drawn = bool(notes)
     evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
     threads = evidence.threads
     start = start_of_training(evidence, settings.seed, warm_start)
@@ -150,4 +151,4 @@ def fit_fusion(
     )
     if not training.interrupted:
         progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
-    return replace(result, model=model, interrupted=training.interrupted)
+    return replace(result, model=model, halves_drawn=drawn, interrupted=training.interrupted)

@@ -16,7 +16,6 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
-from tungsten_dip.errors import InputError
 from tungsten_dip.fit.device import compute_device, convolution_dtype
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
@@ -143,18 +142,16 @@ def fit_paper(
     progress: Progress = silent,
     warm_start: Model | None = None,
 ) -> FitResult:
-    """Denoise by the published method, starting from the weights of a model if there is one.
+    """Denoise sanitised buffers by the published method, from the weights of a model if there is one.
 
     Ends after ``settings.iterations`` or ``settings.time_budget_s``, whichever comes first, but not before
     the first iteration. An interrupt (KeyboardInterrupt) after it ends the fit with the average so far. On a
     CPU, the same seed and number of threads give the same bits.
 
-    Raises InputError if the image is empty or holds NaN, a feature named by the inputs is missing, the
-    device is not there, or the model does not fit the image or the settings.
+    Raises InputError if a feature named by the inputs is missing, the device is not there, or the model does
+    not fit the image or the settings.
     """
     start = time.perf_counter()
-    if buffers.color.mean.size == 0:
-        raise InputError(f"expected at least one pixel, got {buffers.width}x{buffers.height}; render more")
     images = paper_images(buffers, settings)
     if warm_start is not None:
         check_planes(warm_start, images.planes)

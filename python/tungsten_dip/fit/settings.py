@@ -60,12 +60,18 @@ class FitSettings:
                 )
         for name, least, most in _WHOLE_NUMBERS:
             value = getattr(self, name)
-            if value is not None and not _is_whole(value, least, most):
+            if value is None:
+                continue
+            if not _is_whole(value, least, most):
                 raise InputError(f"{name}: expected a whole number from {least} to {most}, got {value!r:.40}")
+            object.__setattr__(self, name, int(value))  # of numpy's numbers JSON knows nothing
         for name in ("time_budget_s", "target_error"):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Real) and float(value) > 0):
+            if value is None:
+                continue
+            if not (isinstance(value, Real) and float(value) > 0):
                 raise InputError(f"{name}: expected a number above 0, got {value!r:.40}")
+            object.__setattr__(self, name, float(value))
         counts = self.channels
         if (
             not isinstance(counts, tuple)
@@ -76,6 +82,7 @@ class FitSettings:
                 f"channels: expected at most {_MOST_SCALES} counts from 1 to {_MOST_CHANNELS}, such as "
                 f"8,16,32,64,128, got {counts!r:.40}"
             )
+        object.__setattr__(self, "channels", tuple(map(int, counts)))
         for name in PAPER_SETTINGS:
             if self.preset != "paper" and getattr(self, name) != getattr(type(self), name):
                 raise InputError(f"{name}: only the preset paper leaves that open; choose the preset paper")
@@ -103,7 +110,8 @@ class FitResult:
     around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
     half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their mean
     with the preset draft, and with the others moved from it towards what all samples say. These are None with
-    the preset paper. ``model`` is the fitted network, None where there was no noise to fit one to.
+    the preset paper. ``halves_drawn`` tells that the image came without independent halves, which were drawn
+    from it (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
     ``interrupted`` tells that Ctrl-C ended the fit early. ``notes`` says in one line each what evidence was
     missing and what that meant.
     """
@@ -115,6 +123,7 @@ class FitResult:
     error: FloatImage | None = None
     estimated_relmse: float | None = None
     halves: Halves | None = None
+    halves_drawn: bool = False
     model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()
     interrupted: bool = False

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import onnx
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.graphs.builder import GraphBuilder
 
 # Read as it is imported: otherwise onnxruntime keeps a device id, and sends what it is used for to Microsoft.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
@@ -20,8 +21,17 @@ _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 def check_device(device: Device) -> None:
     """Raise InputError if onnxruntime cannot compute there."""
-    if device == "cuda" and _CUDA not in ort.get_available_providers():
+    if device != "cuda":
+        return
+    # An onnxruntime that was built for GPUs, but lacks a library of theirs, takes the CPU without a word.
+    if _CUDA not in ort.get_available_providers() or _CUDA not in _trial_session().get_providers():
         raise InputError("device cuda: expected an onnxruntime that can use one, found none; use cpu or auto")
+
+
+def _trial_session() -> Any:
+    graph = GraphBuilder()
+    graph.add("Identity", "x", output="y")
+    return session_from_proto(graph.model("trial", {"x": (1,)}, {"y": (1,)}, metadata={}, version=""), 1)
 
 
 def session_from_proto(proto: onnx.ModelProto, threads: int, device: Device = "auto") -> Any:

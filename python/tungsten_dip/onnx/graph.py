@@ -1,4 +1,4 @@
-"""The graphs of the networks: what `fit.fusion` and `fit.networks` compute, in plain operators.
+"""The graphs of the networks: what `fit.pointwise` and `fit.networks` compute, in plain operators.
 
 The height and width of the inputs are free. A batch holds images that know nothing of one another: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.

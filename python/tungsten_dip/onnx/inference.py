@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,24 +9,21 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
-from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
+from tungsten_dip.fit.preparation import prepared, with_notes
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
-
-_LOG = logging.getLogger(__name__)
 
 _BAND_PIXELS = 1 << 18
 _RUN_PIXELS = 1 << 13
@@ -57,46 +53,45 @@ def infer(
     """
     if refit_steps < 0:
         raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
-    # When to stop was said of the model's own fit. (A FitSettings checks the threads as well.)
-    settings = replace(
-        model.settings,
-        threads=threads,
-        iterations=refit_steps or None,
-        time_budget_s=None,
-        target_error=None,
-        device="auto",
-    )
+    settings = _settings(model, threads, refit_steps)
     if model.layout is not None and refit_steps:
         return denoise(
             buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
         )
-    if buffers.color.mean.size == 0:
-        raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
-    given = checked_candidates(buffers, candidates)
-    previous = checked_previous(buffers, previous)
-    buffers, mended = sanitize(buffers, threads)
+    known = prepared(buffers, candidates, previous, threads)
     if model.layout is not None:
-        result = _infer_fusion(model, buffers, settings, given, previous, progress)
+        result = infer_fusion(model, known.buffers, threads, progress, known.candidates, known.previous)
     else:
-        if refit_steps or given or previous is not None:
+        if refit_steps or known.candidates or known.previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
-        result = _infer_paper(model, buffers, settings, progress)
-    result = replace(result, notes=(*mended, *result.notes))
-    for note in result.notes:
-        _LOG.info(note)
-    return result
+        result = _infer_paper(model, known.buffers, settings, progress)
+    return with_notes(result, known.notes)
 
 
-def _infer_fusion(
+def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:
+    # When to stop was said of the model's own fit. (A FitSettings checks the threads as well.)
+    return replace(
+        model.settings,
+        threads=threads,
+        iterations=steps or None,
+        time_budget_s=None,
+        target_error=None,
+        device="auto",
+    )
+
+
+def infer_fusion(
     model: Model,
     buffers: RenderBuffers,
-    settings: FitSettings,
-    candidates: Sequence[Halves],
-    previous: Halves | None,
-    progress: Progress,
+    threads: int | None = None,
+    progress: Progress = silent,
+    candidates: Sequence[Halves] = (),
+    previous: Halves | None = None,
 ) -> FitResult:
+    """Denoise sanitised buffers with a pointwise network; see `infer`."""
     started = time.perf_counter()
     assert model.layout is not None
+    settings = _settings(model, threads)
     same = result_without_noise(buffers, settings, started)
     if same is not None:
         progress(1.0, "no noise")
@@ -111,7 +106,7 @@ def _infer_fusion(
     fused, whole = _fused(model, evidence, whole_pilots)
     result = result_from_fused(evidence, fused, whole, settings, started, 0, (), notes)
     progress(1.0, "inferred")
-    return replace(result, model=model)
+    return replace(result, model=model, halves_drawn=bool(notes))
 
 
 def _fused(

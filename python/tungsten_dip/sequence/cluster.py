@@ -23,8 +23,6 @@ from tungsten_dip.sequence.following import Follower, Models
 from tungsten_dip.sequence.frames import Frame
 from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
 
-_LOG = logging.getLogger(__name__)
-
 _LONGEST_TASK = 24
 """Frames; a task that is done again has to look at all of them."""
 

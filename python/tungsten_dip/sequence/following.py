@@ -14,16 +14,16 @@ from typing import Literal
 
 import numpy as np
 
-from tungsten_dip import fit
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
-from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
+from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.preparation import prepared, with_notes
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.onnx import inference
+from tungsten_dip.onnx.inference import infer_fusion
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker
@@ -91,6 +91,7 @@ class Follower:
         self._refit = refit
         self._last: _Last | None = None
         self._error: float | None = None
+        self._told = False
 
     def denoise(
         self, buffers: RenderBuffers, camera: Camera | None = None, progress: Progress = silent
@@ -101,9 +102,9 @@ class Follower:
         """
         if camera is not None:
             check_camera(camera, buffers)
-        buffers, mended = sanitize(buffers, self._settings.threads)
-        for note in mended:
-            _LOG.info(note)
+            self._tell_what_is_missing(buffers)
+        known = prepared(buffers, threads=self._settings.threads)
+        buffers = known.buffers
         smooth = self._with_smooth_albedo(buffers) if camera is not None else buffers
         how: How = "fitted"
         try:
@@ -112,12 +113,17 @@ class Follower:
             _LOG.info("a cut: %s", cut)
             how, followed = "cut", None
         if followed is None:
-            followed = Followed(fit.denoise(buffers, self._settings, progress), how)
+            followed = Followed(fit_fusion(buffers, self._settings, progress), how)
             self.models = replace(self.models, first=followed.result.model)
         result = followed.result
         self._error = _typical_error(result)
         self._last = _Last(buffers, smooth, camera, result)
-        return replace(followed, result=replace(result, notes=(*mended, *result.notes)))
+        return replace(followed, result=with_notes(result, known.notes))
+
+    def _tell_what_is_missing(self, buffers: RenderBuffers) -> None:
+        if buffers.depth is None and not self._told:
+            self._told = True
+            _LOG.warning("no depth: frames cannot be moved by their cameras, and do not help one another")
 
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
         alone = buffers.with_quantities(normal=None, depth=None)
@@ -144,17 +150,19 @@ class Follower:
             try:
                 if steps == 0:
                     threads = self._settings.threads
-                    result = inference.infer(model, buffers, progress, threads=threads, previous=moved)
+                    result = infer_fusion(model, buffers, threads, progress, previous=moved)
                 else:
                     settings = replace(self._settings, iterations=steps)
-                    result = fit.denoise(buffers, settings, progress, warm_start=model, previous=moved)
+                    result = fit_fusion(buffers, settings, progress, warm_start=model, previous=moved)
             except InputError as problem:
                 if last is None:
                     raise  # The model was made for something else.
+                if moved is not None:  # Those that come will be like this one: they get another network.
+                    self.models = replace(self.models, following=None)
                 raise _CutError(str(problem)) from problem
         elif moved is not None:
             settings = replace(self._settings, iterations=_MOST_STEPS)
-            result = fit.denoise(buffers, settings, progress, previous=moved)
+            result = fit_fusion(buffers, settings, progress, previous=moved)
         else:
             return None
         error = _typical_error(result)
@@ -192,9 +200,10 @@ def _typical_error(result: FitResult) -> float | None:
 
 
 def _flicker(last: _Last, buffers: RenderBuffers, result: FitResult) -> float | None:
+    """Return the flicker that the halves tell, None unless those of both frames are the renderer's."""
     color, before = buffers.color, last.buffers.color
     if result.halves is None or last.result.halves is None:
         return None
-    if color.halves is None or before.halves is None:
+    if color.halves is None or before.halves is None or result.halves_drawn or last.result.halves_drawn:
         return None
     return estimated_flicker(result.halves, last.result.halves, color.halves, before.halves)

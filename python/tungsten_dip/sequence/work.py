@@ -52,7 +52,8 @@ class Run:
 class Record:
     """What became of a frame. ``how`` is as in `following.Followed`; ``error`` says why there is no result.
 
-    ``seconds`` is all that the frame took but for writing it. ``skipped``: it was finished before.
+    ``seconds`` is all that the frame took but for writing it. ``flicker`` is that against the frame before,
+    where the run denoised it. ``skipped``: it was finished before.
     """
 
     number: int
@@ -112,11 +113,12 @@ def denoise_frames(
     """
     follower = Follower(run.settings, run.refit, models)
     frames = list(frames)
-    records = []
+    records: list[Record] = []
     for index, frame in enumerate(frames):
+        beside = bool(records) and records[-1].error is None and not records[-1].skipped
         try:
             record = finished(frame, run) or _denoise(
-                frame, run, follower, _part(progress, index, len(frames), frame)
+                frame, run, follower, beside, _part(progress, index, len(frames), frame)
             )
         except (InputError, OSError) as error:
             record = failed(frame, error)
@@ -125,7 +127,8 @@ def denoise_frames(
     return records, follower.models
 
 
-def _denoise(frame: Frame, run: Run, follower: Follower, progress: Progress) -> Record:
+def _denoise(frame: Frame, run: Run, follower: Follower, beside: bool, progress: Progress) -> Record:
+    """Denoise and write a frame; ``beside`` tells that the follower's last one is the one before it."""
     started = time.perf_counter()
     key = _key(frame, run)
     buffers = read_buffers(frame.input, run.mapping)
@@ -142,7 +145,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, progress: Progress) -> 
         seconds=time.perf_counter() - started,
         iterations=result.iterations,
         estimated_relmse=result.estimated_relmse,
-        flicker=followed.flicker,
+        flicker=followed.flicker if beside else None,
     )
     attributes = {**buffers.attributes, _RECORD: json.dumps({"key": key, **asdict(record)})}
     frame.output.parent.mkdir(parents=True, exist_ok=True)
