@@ -42,6 +42,9 @@ _BRIGHTEST = 1e15
 
 SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
+_NEAR_RADIUS = 2
+"""Of the windows that must be empty for a pixel to be empty space."""
+
 OUTLIER = 20.0
 """Squared errors are capped at so many times the local mean where they tell how noisy a place is."""
 
@@ -181,7 +184,7 @@ def evidence_from_buffers(
     images: list[Halves] = [halves]
     computed: dict[Pilot, Halves] = {}
     filled = None
-    something = _something(halves, buffers)
+    something = _something(halves, buffers, threads)
     if previous is None:
         guides = first_guides(halves, guidance)
     else:
@@ -239,7 +242,7 @@ def pilots_of_all_samples(
     guides = first_guides(colors, guidance, variance)
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
     maker = PilotMaker(colors, guidance, guides, variance)
-    something = _something(evidence.halves, buffers)
+    something = _something(evidence.halves, buffers, evidence.threads)
     pilots = evidence.layout.pilots
     computed = []
     for pilot in pilots:
@@ -320,7 +323,7 @@ def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: 
     return a, b
 
 
-def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
+def _something(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:
     """0 where no sample in the 5x5 pixels around hit anything or brought light, else 1; (height, width, 1).
 
     Empty space is black to the eye only if it is black: what filters spread into it is seen at once.
@@ -328,11 +331,8 @@ def _something(halves: Halves, buffers: RenderBuffers) -> FloatImage:
     if buffers.depth is None:
         return np.ones((1, 1, 1), np.float32)
     seen = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
-    padded = np.pad(seen, ((2, 2), (2, 2), (0, 0)))
-    height, width = seen.shape[:2]
-    near = [padded[dy : dy + height, dx : dx + width] for dy in range(5) for dx in range(5)]
-    something: FloatImage = np.logical_or.reduce(near).astype(np.float32)
-    return something
+    near = _core.box_mean(seen.astype(np.float32), _NEAR_RADIUS, threads) > 0
+    return near.astype(np.float32)
 
 
 def _notes_on_features(buffers: RenderBuffers) -> list[str]:

@@ -172,7 +172,7 @@ def result_from_fused(
     notes = [*evidence.notes, *notes]
     told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
     if told >= error_of_input:
-        notes.append("the input is as good as anything fitted to it, and is returned as it is")
+        notes.append("the input is as good as anything fitted to it, and is returned")
         image, fused = evidence.mean, evidence.halves
         epsilon = _epsilon_of_renderer(evidence.scale)
         error = _relative(squared, image**2 + epsilon).mean(axis=2, keepdims=True)

@@ -128,7 +128,7 @@ class Standardisation:
     def apply(self, inputs: FloatArray, threads: int) -> None:
         """Standardise planes in place, shape (2, pixels, planes), clipped to 4 standard deviations."""
 
-        def apply(half: int) -> None:
+        def standardise(half: int) -> None:
             for part in _parts(inputs[half]):
                 np.clip(
                     (part - self.mean) / self.std,
@@ -138,7 +138,7 @@ class Standardisation:
                     casting="same_kind",
                 )
 
-        of_both_halves(apply, threads)
+        of_both_halves(standardise, threads)
 
 
 def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
