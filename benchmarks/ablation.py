@@ -52,7 +52,7 @@ VARIANTS: dict[str, Change] = {
         pilots, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
     "no pilots of all samples": lambda: mock.patch.object(fusion, "pilots_of_all_samples", return_value=()),
-    "empty space like any other": lambda: mock.patch.object(evidence, "_something", return_value=1),
+    "empty space like any other": lambda: mock.patch.object(evidence, "_occupied", return_value=1),
 }
 
 

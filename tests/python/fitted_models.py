@@ -6,6 +6,7 @@ from typing import Any
 
 from tungsten_dip.buffers import RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.model import Model
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -30,4 +31,4 @@ def session_of(model: Model) -> Any:
 
 def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
     """Return what a fit of preset draft knows of the buffers, with other pilots."""
-    return evidence_from_buffers(buffers, DRAFT, pilots, (), 0.0, silent)
+    return evidence_from_buffers(buffers, DRAFT, pilots, (), Clock(), silent)

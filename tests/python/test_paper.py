@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
-from tungsten_dip.fit import paper  # noqa: E402
+from tungsten_dip.fit import denoise, paper  # noqa: E402
 from tungsten_dip.fit.inputs import ldr_from_radiance, paper_images, radiance_from_ldr  # noqa: E402
 from tungsten_dip.fit.paper import INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
 from tungsten_dip.fit.settings import FitSettings  # noqa: E402
@@ -259,7 +259,7 @@ def test_one_pixel_and_none():
         3,
     )
     with pytest.raises(InputError, match="at least one pixel, got 5x0"):
-        fit_paper(noise_buffers(0, 5), settings())
+        denoise(noise_buffers(0, 5), settings())
 
 
 def test_nan_is_refused():

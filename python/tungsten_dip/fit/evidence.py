@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import Event
@@ -16,6 +14,7 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
@@ -144,96 +143,105 @@ class Evidence:
 def evidence_from_buffers(
     buffers: RenderBuffers,
     settings: FitSettings,
-    pilots: Sequence[Pilot] | Layout,
+    pilots: Sequence[Pilot],
     candidates: Sequence[Halves],
-    started: float,
+    clock: Clock,
     progress: Progress,
     previous: Halves | None = None,
+    layout: Layout | None = None,
 ) -> Evidence:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
-    The buffers have halves, and their noise is independent (`splitting`).
-    ``pilots`` as a layout, of a network that exists, says all that it expects; all its pilots are computed.
-    ``candidates`` are further pilots that somebody else computed, of linear radiance. ``previous`` is one
-    more, NaN where it shows nothing, that guides the others as well. ``started`` is a value of
-    time.perf_counter.
+    The buffers have halves, and their noise is independent (`splitting`). ``candidates`` are further pilots
+    that somebody else computed, of linear radiance. ``previous`` is one more, NaN where it shows nothing,
+    that guides the others as well. ``layout`` is that of a network which exists, the pilots being its own:
+    all of them are computed.
 
-    Raises InputError if a layout names a feature that is missing or another number of candidates.
+    Raises InputError if the layout names a feature that is missing or another number of candidates.
     """
     notes = _notes_on_features(buffers)
-    scale = exposure(buffers.color.mean)
-    color = buffers.color
-    assert color.halves is not None
-    half_a, half_b = color.halves
     threads = thread_count(settings.threads)
-    layout = pilots if isinstance(pilots, Layout) else None
-    described = pilots.pilots if isinstance(pilots, Layout) else tuple(pilots)
-
-    mean = scaled(color.mean, scale)
-    halves, fireflies = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
-    if fireflies is not None:
-        notes.append(fireflies)
-        mean = np.float32(0.5) * (halves[0] + halves[1])
+    scale = exposure(buffers.color.mean)
+    mean, halves, fireflies = _without_fireflies(buffers.color, scale, threads)
+    notes += fireflies
     guidance = guidance_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
+    handed_in = [_scaled_halves(pair, scale) for pair in candidates]
     if settings.pilot == "oidn":
-        candidates = (*candidates, _oidn_halves(buffers, halves, scale, settings.threads))
+        # The last of them: `pilots_of_all_samples` relies on it.
+        handed_in.append(_scaled_halves(_oidn_halves(buffers, halves, scale, settings.threads), scale))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, guidance[0], len(candidates) + (previous is not None))
-    images: list[Halves] = [halves]
+        _check_fits(layout, guidance[0], len(handed_in) + (previous is not None))
+    occupied = _occupied(halves, buffers, threads)
     computed: dict[Pilot, Halves] = {}
-    filled = None
-    something = _something(halves, buffers, threads)
+    moved = None
     if previous is None:
         guides = first_guides(halves, guidance)
     else:
-        moved = scaled(previous[0], scale), scaled(previous[1], scale)
-        guides, first, filled = following_guides(halves, moved, guidance)
-        computed[FOLLOWING_PILOTS[0]] = first[0] * something, first[1] * something
-        filled = filled[0] * something, filled[1] * something
-    maker = PilotMaker(halves, guidance, guides, previous=filled)
-    for index, pilot in enumerate(described):
-        progress(0.1 + 0.6 * index / len(described), f"pilot {index + 1}")
+        guides, first, moved = following_guides(halves, _scaled_halves(previous, scale), guidance)
+        computed[FOLLOWING_PILOTS[0]] = _masked(first, occupied)
+        moved = _masked(moved, occupied)
+    maker = PilotMaker(halves, guidance, guides, previous=moved)
+    images: list[Halves] = [halves]
+    for index, pilot in enumerate(pilots):
+        progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE
-        late = time.perf_counter() - started > share * (settings.time_budget_s or math.inf)
-        if layout is None and index > 0 and late:
+        if layout is None and index > 0 and clock.share_spent() > share:
             break
         if pilot not in computed:
-            image_a, image_b = maker.images(pilot)
-            computed[pilot] = image_a * something, image_b * something
+            computed[pilot] = _masked(maker.images(pilot), occupied)
         images.append(computed[pilot])
-    described = described[: len(images) - 1]
-    for image_a, image_b in candidates:
-        images.append((np.maximum(scaled(image_a, scale), 0), np.maximum(scaled(image_b, scale), 0)))
-    if filled is not None:
-        images.append(filled)
+    pilots = tuple(pilots[: len(images) - 1])
+    images += handed_in if moved is None else [*handed_in, moved]
 
-    denominators = denominators_of(images[len(described)])
+    denominators = denominators_of(images[len(pilots)])
     errors = [_errors(pilot, halves, denominators) for pilot in images]
     if layout is None:
-        candidate_count = len(images) - 1 - len(described)
-        layout = Layout(guidance[0].names, described, candidate_count, reference=_best_pilot(errors))
+        candidate_count = len(images) - 1 - len(pilots)
+        layout = Layout(guidance[0].names, pilots, candidate_count, reference=_best_pilot(errors))
     noises = _noises(errors[layout.reference], threads)
     features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
     return Evidence(scale, mean, features, layout, tuple(images), noises, guides.noise, tuple(notes), threads)
+
+
+def _without_fireflies(
+    color: Buffer, scale: float, threads: int
+) -> tuple[FloatImage, Halves, tuple[str, ...]]:
+    """Return the mean and the halves, scaled, and what there is to say of fireflies."""
+    assert color.halves is not None
+    half_a, half_b = color.halves
+    halves, told = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
+    if told is None:
+        return scaled(color.mean, scale), halves, ()
+    return np.float32(0.5) * (halves[0] + halves[1]), halves, (told,)
+
+
+def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:
+    a, b = images
+    return a * occupied, b * occupied
+
+
+def _scaled_halves(halves: Halves, scale: float) -> Halves:
+    """Return candidates of linear radiance in the units of the evidence."""
+    a, b = (np.maximum(scaled(half, scale), 0) for half in halves)
+    return a, b
 
 
 def pilots_of_all_samples(
     evidence: Evidence,
     buffers: RenderBuffers,
     settings: FitSettings,
-    started: float,
+    clock: Clock,
     given_up: Event | None = None,
 ) -> tuple[FloatImage, ...]:
     """Return what the pilots make of all samples, with less noisy features and guides than a half's.
 
     One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
     all for the preset draft, or where the pilots of the halves have used up their share of the time budget,
-    which began at ``started`` (a value of time.perf_counter), or once somebody sets ``given_up``.
+    or once somebody sets ``given_up``.
     """
-    late = time.perf_counter() - started > _PILOTS_SHARE * (settings.time_budget_s or math.inf)
-    if settings.preset == "draft" or late:
+    if settings.preset == "draft" or clock.share_spent() > _PILOTS_SHARE:
         return ()
     colors = (evidence.mean,)
     guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.threads)
@@ -242,13 +250,13 @@ def pilots_of_all_samples(
     guides = first_guides(colors, guidance, variance)
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
     maker = PilotMaker(colors, guidance, guides, variance)
-    something = _something(evidence.halves, buffers, evidence.threads)
+    occupied = _occupied(evidence.halves, buffers, evidence.threads)
     pilots = evidence.layout.pilots
     computed = []
     for pilot in pilots:
         if given_up is not None and given_up.is_set():
             return ()
-        computed.append(maker.images(pilot)[0] * something)
+        computed.append(maker.images(pilot)[0] * occupied)
     handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
@@ -323,7 +331,7 @@ def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: 
     return a, b
 
 
-def _something(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:
+def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:
     """0 where no sample in the 5x5 pixels around hit anything or brought light, else 1; (height, width, 1).
 
     Empty space is black to the eye only if it is black: what filters spread into it is seen at once.

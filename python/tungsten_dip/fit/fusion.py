@@ -7,15 +7,15 @@ linear in the scored half, so noise adds a constant to the loss and nothing to t
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Halves, RenderBuffers
+from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, source_sha256
@@ -31,7 +31,7 @@ from tungsten_dip.fit.pilots import (
 from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.fit.training import start_of_training, train
+from tungsten_dip.fit.training import Start, Training, start_of_training, train
 from tungsten_dip.progress import Progress, silent
 
 _LARGE_RADIUS = 18
@@ -68,76 +68,35 @@ def fit_fusion(
     previous: Halves | None = None,
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
-    started = time.perf_counter()
-    preset = _PRESETS[settings.preset]
-    if previous is not None:
-        preset = _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS)
-    pilots = preset.pilots
-    # One model of first order cannot stand for a whole image.
-    largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)
-    pilots = tuple(pilot for pilot in pilots if pilot.radius <= largest)
-    if settings.time_budget_s is not None and previous is None:
-        # Those of draft are enough by themselves where there is no time for others.
-        pilots = (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
-    asked = pilots if warm_start is None or warm_start.layout is None else warm_start.layout
-    same = result_without_noise(buffers, settings, started)
-    if same is not None:
+    clock = Clock(settings.time_budget_s)
+    unchanged = result_without_noise(buffers, settings, clock)
+    if unchanged is not None:
         progress(1.0, "no noise")
-        return same
+        return unchanged
     buffers, candidates, notes = with_independent_halves(
         buffers, tuple(candidates), settings.seed, settings.threads
     )
     drawn = bool(notes)
-    evidence = evidence_from_buffers(buffers, settings, asked, candidates, started, progress, previous)
-    threads = evidence.threads
+    following = previous is not None
+    preset = _preset(settings, following)
+    layout = None if warm_start is None else warm_start.layout
+    pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
+    evidence = evidence_from_buffers(buffers, settings, pilots, candidates, clock, progress, previous, layout)
     start = start_of_training(evidence, settings.seed, warm_start)
     evidence = start.evidence
     network = PointwiseNetwork(
         start.weights, len(evidence.layout.planes), evidence.layout.choices, settings.device
     )
-    given_up = Event()
-    # The network keeps one core busy; the pilots of all samples take what is left of all of them.
-    with ThreadPoolExecutor(1) as beside:
-        whole_pilots = beside.submit(
-            lambda: (
-                pilots_of_all_samples(evidence, buffers, settings, started, given_up)
-                if previous is None
-                else ()
-            )
-        )
-        try:
-            if threads == 1:
-                wait([whole_pilots])
-            steps = settings.iterations or preset.steps
-            training = train(network, start, settings, steps, preset.batch_pixels, started, progress)
-        except BaseException:
-            given_up.set()
-            raise
-        if training.interrupted:
-            given_up.set()
-        try:
-            images = whole_pilots.result()
-        except KeyboardInterrupt:
-            given_up.set()
-            images = ()
-            training.interrupted = True
-            training.notes.append("interrupted: the image is made of the halves alone")
-    shape = evidence.mean.shape
-    halves = [start.examples.of_half(half) for half in (0, 1)]
-    fused = of_both_halves(lambda half: network.fuse(halves[half]).reshape(shape), threads)
-    whole = None
-    if images:
-        by_a, by_b = of_both_halves(lambda half: network.fuse(halves[half], images).reshape(shape), threads)
-        whole = np.float32(0.5) * (by_a + by_b)
+
+    def whole_pilots(given_up: Event) -> tuple[FloatImage, ...]:
+        # The previous frame moved into place has no counterpart among them.
+        return () if following else pilots_of_all_samples(evidence, buffers, settings, clock, given_up)
+
+    training, images = _trained(network, start, settings, preset, clock, progress, whole_pilots)
+    fused, whole = _fused(network, start, images)
+    notes = (*notes, *training.notes)
     result = result_from_fused(
-        evidence,
-        fused,
-        whole,
-        settings,
-        started,
-        training.steps_done,
-        training.history,
-        [*notes, *training.notes],
+        evidence, fused, whole, settings, clock, training.steps_done, training.history, notes
     )
     model = Model(
         kind="pointwise",
@@ -152,3 +111,71 @@ def fit_fusion(
     if not training.interrupted:
         progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
     return replace(result, model=model, halves_drawn=drawn, interrupted=training.interrupted)
+
+
+def _preset(settings: FitSettings, following: bool) -> _Preset:
+    preset = _PRESETS[settings.preset]
+    return _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS) if following else preset
+
+
+def _pilots(
+    buffers: RenderBuffers, settings: FitSettings, preset: _Preset, following: bool
+) -> tuple[Pilot, ...]:
+    """Return the preset's pilots, as far as the image is large enough, in the order of their use."""
+    # One model of first order cannot stand for a whole image.
+    largest = max(_LARGE_RADIUS, (max(buffers.width, buffers.height) - 1) // 2)
+    pilots = tuple(pilot for pilot in preset.pilots if pilot.radius <= largest)
+    if settings.time_budget_s is None or following:
+        return pilots
+    # Those of draft are enough by themselves where there is no time for others.
+    return (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
+
+
+def _trained(
+    network: PointwiseNetwork,
+    start: Start,
+    settings: FitSettings,
+    preset: _Preset,
+    clock: Clock,
+    progress: Progress,
+    whole_pilots: Callable[[Event], tuple[FloatImage, ...]],
+) -> tuple[Training, tuple[FloatImage, ...]]:
+    """Train the network and compute the pilots of all samples meanwhile; return both.
+
+    ``whole_pilots`` is to return none once the event that it is given is set: Ctrl-C ends both early.
+    """
+    given_up = Event()
+    # The network keeps one core busy; the pilots of all samples take what is left of all of them.
+    with ThreadPoolExecutor(1) as beside:
+        pending = beside.submit(whole_pilots, given_up)
+        try:
+            if start.evidence.threads == 1:
+                wait([pending])
+            steps = settings.iterations or preset.steps
+            training = train(network, start, settings, steps, preset.batch_pixels, clock, progress)
+        except BaseException:
+            given_up.set()
+            raise
+        if training.interrupted:
+            given_up.set()
+        try:
+            images = pending.result()
+        except KeyboardInterrupt:
+            given_up.set()
+            images = ()
+            training.interrupted = True
+            training.notes.append("interrupted: the image is made of the halves alone")
+    return training, images
+
+
+def _fused(
+    network: PointwiseNetwork, start: Start, whole_pilots: tuple[FloatImage, ...]
+) -> tuple[Halves, FloatImage | None]:
+    """Return what the network makes of both halves and, where their pilots are given, of all samples."""
+    threads, shape = start.evidence.threads, start.evidence.mean.shape
+    halves = [start.examples.of_half(half) for half in (0, 1)]
+    fused = of_both_halves(lambda half: network.fuse(halves[half]).reshape(shape), threads)
+    if not whole_pilots:
+        return fused, None
+    by_a, by_b = of_both_halves(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
+    return fused, np.float32(0.5) * (by_a + by_b)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_what_was_lost
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
@@ -35,11 +35,10 @@ _CONVERGED = 1e-5
 """relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
 
-def result_without_noise(buffers: RenderBuffers, settings: FitSettings, started: float) -> FitResult | None:
+def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: Clock) -> FitResult | None:
     """Return the image as it is if its halves hardly differ, else None.
 
     Copies do not differ at all: they tell something only if the variance, too, says that there is no noise.
-    ``started`` is a value of time.perf_counter.
     """
     color = buffers.color
     if color.halves is None:
@@ -57,7 +56,7 @@ def result_without_noise(buffers: RenderBuffers, settings: FitSettings, started:
     return FitResult(
         color=color.mean.copy(),
         settings=settings,
-        seconds=time.perf_counter() - started,
+        seconds=clock.seconds(),
         iterations=0,
         error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
         estimated_relmse=float(error.mean(dtype=np.float64)),
@@ -147,7 +146,7 @@ def result_from_fused(
     fused: Halves,
     whole: FloatImage | None,
     settings: FitSettings,
-    started: float,
+    clock: Clock,
     iterations: int,
     history: Sequence[HistoryPoint] = (),
     notes: Sequence[str] = (),
@@ -179,7 +178,7 @@ def result_from_fused(
     return FitResult(
         color=unscaled(image, evidence.scale),
         settings=settings,
-        seconds=time.perf_counter() - started,
+        seconds=clock.seconds(),
         iterations=iterations,
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),

@@ -8,7 +8,6 @@ image. ``docs/method.md`` states it whole, and where this differs from the publi
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.device import compute_device, convolution_dtype
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
@@ -151,7 +151,7 @@ def fit_paper(
     Raises InputError if a feature named by the inputs is missing, the device is not there, or the model does
     not fit the image or the settings.
     """
-    start = time.perf_counter()
+    clock = Clock(settings.time_budget_s)
     images = paper_images(buffers, settings)
     if warm_start is not None:
         check_planes(warm_start, images.planes)
@@ -165,11 +165,10 @@ def fit_paper(
             while iteration < total:
                 fit.step()
                 iteration += 1
-                seconds = time.perf_counter() - start
-                spent = seconds / settings.time_budget_s if settings.time_budget_s else 0.0
+                spent = clock.share_spent()
                 done = iteration == total or spent >= 1
                 if done or iteration % _HISTORY_EVERY == 0:
-                    history.append(HistoryPoint(seconds, iteration, None))
+                    history.append(HistoryPoint(clock.seconds(), iteration, None))
                 progress(
                     min(max(iteration / total, spent), 1.0),
                     f"iteration {iteration}, loss {fit.loss:.2e}, PSNR to noisy {fit.psnr:.2f} dB",
@@ -186,11 +185,10 @@ def fit_paper(
                 notes.append(f"the time budget ended at iteration {iteration} of {total}")
         color, weights = fit.color(), fit.weights()
     model = Model(settings.network, images.planes, weights, settings, None, source_sha256(buffers))
-    seconds = time.perf_counter() - start
     return FitResult(
         color,
         settings,
-        seconds,
+        clock.seconds(),
         iteration,
         model=model,
         history=tuple(history),

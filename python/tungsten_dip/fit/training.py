@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -11,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, Indices, Layout, with_best_reference
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, Weights
@@ -165,7 +165,7 @@ def train(
     settings: FitSettings,
     steps: int,
     batch_pixels: int,
-    started: float,
+    clock: Clock,
     progress: Progress,
 ) -> Training:
     """Train for ``steps`` steps, or fewer: within the time budget, to the target error, until Ctrl-C.
@@ -191,18 +191,18 @@ def train(
         fused_a, fused_b = of_both_halves(lambda half: network.fuse(probes[half]), threads)
         errors = estimate_error(pilots, start.evidence.scale, fused_a, fused_b)
         error = float(errors.mean(dtype=np.float64))
-        done.history.append(HistoryPoint(time.perf_counter() - started, step, error))
+        done.history.append(HistoryPoint(clock.seconds(), step, error))
         return error, held_out_error(pilots, fused_a, fused_b)
 
     every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
-    begun, deadline = time.perf_counter(), started + (settings.time_budget_s or math.inf)
-    left_s = max(deadline - begun, 1e-9)
+    spent_before = clock.share_spent()
+    left = max(1 - spent_before, 1e-9)
     best, best_weights, since_best = (estimate(0)[1], network.weights(), 0) if warm else (math.inf, {}, 0)
     try:
         for step in range(1, steps + 1):
             rate = min(1.0, step / _WARM_UP_STEPS)
             # What the learning rate anneals over is what ends first: the steps or the budget.
-            gone = max((step - 1) / steps, min((time.perf_counter() - begun) / left_s, 1.0))
+            gone = max((step - 1) / steps, min((clock.share_spent() - spent_before) / left, 1.0))
             rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * gone)
             network.step(next(batches), LEARNING_RATE * rate)
             done.steps_done = step
@@ -217,7 +217,7 @@ def train(
             if error <= (settings.target_error or -math.inf):
                 done.notes.append(f"stopped at step {step}: the target error is reached")
                 break
-            if time.perf_counter() > deadline:
+            if clock.share_spent() > 1:
                 done.notes.append(f"stopped at step {step}: the time budget is spent")
                 break
             if since_best >= _WARM_PATIENCE:

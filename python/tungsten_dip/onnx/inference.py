@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuf
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
+from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
@@ -89,22 +89,25 @@ def infer_fusion(
     previous: Halves | None = None,
 ) -> FitResult:
     """Denoise sanitised buffers with a pointwise network; see `infer`."""
-    started = time.perf_counter()
+    clock = Clock()
     assert model.layout is not None
     settings = _settings(model, threads)
-    same = result_without_noise(buffers, settings, started)
-    if same is not None:
+    unchanged = result_without_noise(buffers, settings, clock)
+    if unchanged is not None:
         progress(1.0, "no noise")
-        return same
+        return unchanged
     buffers, candidates, notes = with_independent_halves(
         buffers, tuple(candidates), settings.seed, settings.threads
     )
-    evidence = evidence_from_buffers(buffers, settings, model.layout, candidates, started, progress, previous)
+    layout = model.layout
+    evidence = evidence_from_buffers(
+        buffers, settings, layout.pilots, candidates, clock, progress, previous, layout
+    )
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
-        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, started)
+        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, clock)
     fused, whole = _fused(model, evidence, whole_pilots)
-    result = result_from_fused(evidence, fused, whole, settings, started, 0, (), notes)
+    result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), notes)
     progress(1.0, "inferred")
     return replace(result, model=model, halves_drawn=bool(notes))
 
@@ -148,7 +151,7 @@ def _fused(
 def _infer_paper(
     model: Model, buffers: RenderBuffers, settings: FitSettings, progress: Progress
 ) -> FitResult:
-    started = time.perf_counter()
+    clock = Clock()
     images = paper_images(buffers, settings)
     check_planes(model, images.planes)
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
@@ -158,8 +161,7 @@ def _infer_paper(
     ldr = output[0, :3].transpose(1, 2, 0)
     color: FloatImage = np.ascontiguousarray(radiance_from_ldr(ldr))
     progress(1.0, "inferred")
-    seconds = time.perf_counter() - started
-    return FitResult(color, settings, seconds, iterations=0, model=model, notes=images.notes)
+    return FitResult(color, settings, clock.seconds(), iterations=0, model=model, notes=images.notes)
 
 
 def _finite(output: FloatArray) -> FloatArray:

@@ -11,14 +11,12 @@ import numpy as np
 from tungsten_dip.buffers.model import FEATURES, FloatImage, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
 from tungsten_dip.report import parts
+from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.parts import Picture
 from tungsten_dip.report.preview import error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
 
-CURVE_WIDTH, CURVE_HEIGHT = 720, 260
-CURVE_LEFT, CURVE_RIGHT, CURVE_TOP, CURVE_BOTTOM = 90, 24, 20, 56
-"""Size of the plot and its margins in the units of the SVG."""
-
+_CURVE_HEIGHT = 260
 _SKY_DEPTH = 1e9
 """The same as in `buffers.sanitize`."""
 
@@ -113,39 +111,31 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
     known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
     if len(known) < 2:
         return "<p>Nothing independent was there to judge by, so the error was not estimated on the way.</p>"
-    seconds = [point.seconds for point, _ in known]
-    levels = [math.log10(relmse) for _, relmse in known]
-    ticks = _round_ticks(10 ** min(levels), 10 ** max(levels))
+    end_s = max(known[-1][0].seconds, 1e-9)
+    ticks = _round_ticks(min(relmse for _, relmse in known), max(relmse for _, relmse in known))
     bottom, top = math.log10(ticks[0]), math.log10(ticks[-1])
 
-    def x(time_s: float) -> float:
-        return CURVE_LEFT + time_s / max(seconds[-1], 1e-9) * (CURVE_WIDTH - CURVE_LEFT - CURVE_RIGHT)
+    def y(relmse: float) -> float:
+        return (math.log10(relmse) - bottom) / (top - bottom)
 
-    def y(level: float) -> float:
-        return CURVE_TOP + (top - level) / (top - bottom) * (CURVE_HEIGHT - CURVE_TOP - CURVE_BOTTOM)
-
-    drawn = []
-    right = CURVE_WIDTH - CURVE_RIGHT
-    for tick in ticks:
-        at, label = f"{y(math.log10(tick)):.1f}", f"{tick:g}"
-        drawn.append(f'<line class="gridline" x1="{CURVE_LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
-        drawn.append(f'<text x="{CURVE_LEFT - 8}" y="{at}" dy="4" text-anchor="end">{label}</text>')
-    step = _round_step(seconds[-1] / 6)
-    for count in range(int(seconds[-1] / step) + 1):
-        place = f'x="{x(count * step):.1f}" y="{CURVE_HEIGHT - CURVE_BOTTOM + 22}"'
-        drawn.append(f'<text {place} text-anchor="middle">{count * step:g}</text>')
-    drawn.append(f'<text x="{right}" y="{CURVE_HEIGHT - 6}" text-anchor="end">seconds</text>')
-    line = " ".join(f"{x(time):.1f},{y(level):.1f}" for time, level in zip(seconds, levels, strict=True))
-    drawn.append(f'<polyline class="curve" points="{line}"/>')
-    for (point, relmse), level in zip(known, levels, strict=True):
-        told = f"{point.seconds:.1f} s, iteration {point.iteration}: relMSE {relmse:.3g}"
-        place = f'cx="{x(point.seconds):.1f}" cy="{y(level):.1f}" r="3"'
-        drawn.append(f"<circle {place}><title>{told}</title></circle>")
-    return (
-        '<p>Estimated relMSE, logarithmic.</p><svg class="curve-plot" role="img" '
-        f'viewBox="0 0 {CURVE_WIDTH} {CURVE_HEIGHT}" aria-label="Estimated relMSE over seconds">'
-        f"{''.join(drawn)}</svg>"
+    points = [
+        Point(
+            point.seconds / end_s,
+            y(relmse),
+            f"{point.seconds:.1f} s, iteration {point.iteration}: relMSE {relmse:.3g}",
+        )
+        for point, relmse in known
+    ]
+    step_s = _round_step(end_s / 6)
+    times = [count * step_s for count in range(int(end_s / step_s) + 1)]
+    plot = line_plot(
+        "Estimated relMSE over seconds",
+        points,
+        below=[Label(time_s / end_s, f"{time_s:g} s") for time_s in times],
+        beside=[Label(y(tick), f"{tick:g}") for tick in ticks],
+        height=_CURVE_HEIGHT,
     )
+    return f"<p>Estimated relMSE, logarithmic.</p>{plot}"
 
 
 def _round_ticks(low: float, high: float) -> list[float]:

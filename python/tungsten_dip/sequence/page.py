@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,14 @@ import numpy as np
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.buffers.read import read_image
 from tungsten_dip.report import parts
+from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.parts import Picture
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.sequence.work import Record
 
 _MOST_PICTURES = 24
 _PICTURE_WIDTH = 320
-_WIDTH, _HEIGHT = 720, 180
-_LEFT, _RIGHT, _TOP, _BOTTOM = 120, 24, 20, 40
-"""Size of a plot and its margins in the units of the SVG."""
+_PLOT_HEIGHT = 180
 
 _FLICKER_NOTE = (
     "Relative squared error of the change from one frame to the next, at the same pixel, estimated without a "
@@ -97,27 +95,15 @@ def _plot(records: Sequence[Record], what: str, value_of: Callable[[Record], flo
         return "<p>Not known.</p>"
     first, last = points[0][0], points[-1][0]
     top = max(max(value for _, value in points), 1e-12)
-    right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
-
-    def place(number: int, value: float) -> tuple[float, float]:
-        across = (number - first) / max(last - first, 1)
-        return _LEFT + across * (right - _LEFT), bottom - value / top * (bottom - _TOP)
-
-    lines = []
-    for share in (0.0, 0.5, 1.0):
-        _, y = place(first, share * top)
-        lines.append(f'<line class="gridline" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        label = f"{share * top:.3g}"
-        lines.append(f'<text x="{_LEFT - 8}" y="{y:.1f}" dy="4" text-anchor="end">{label}</text>')
-    for number, anchor in ((first, "start"), (last, "end"))[: 1 + (last > first)]:
-        x, _ = place(number, 0)
-        lines.append(f'<text x="{x:.1f}" y="{_HEIGHT - 12}" text-anchor="{anchor}">frame {number}</text>')
-    places = [place(*point) for point in points]
-    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-    lines.append(f'<polyline class="curve" points="{path}"/>')
-    for (number, value), (x, y) in zip(points, places, strict=True):
-        told = escape(f"frame {number}: {value:.3g}")
-        lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3"><title>{told}</title></circle>')
-    label = f"{what} of every frame"
-    svg = f'<svg class="curve-plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">'
-    return f"{svg}{''.join(lines)}</svg>"
+    span = max(last - first, 1)
+    ends = [Label(0, f"frame {first}", "start"), Label(1, f"frame {last}", "end")]
+    return line_plot(
+        f"{what} of every frame",
+        [
+            Point((number - first) / span, value / top, f"frame {number}: {value:.3g}")
+            for number, value in points
+        ],
+        below=ends if last > first else ends[:1],
+        beside=[Label(share, f"{share * top:.3g}") for share in (0.0, 0.5, 1.0)],
+        height=_PLOT_HEIGHT,
+    )
