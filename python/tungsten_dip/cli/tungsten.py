@@ -6,9 +6,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tungsten_dip
 from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
@@ -36,10 +34,10 @@ from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import Camera, PinholeCamera, Scene, ThinlensCamera
 
-if TYPE_CHECKING:
-    from tungsten_dip.sequence.following import Follower
-
 log = logging.getLogger(__name__)
+
+Denoise = Callable[[Camera, RenderBuffers], FitResult]
+"""Denoises the render of a camera."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,24 +45,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run("tungsten", lambda: _run(arguments))
 
 
-def denoise_outputs(
+def write_outputs(
+    result: FitResult,
     buffers: RenderBuffers,
     outputs: SceneOutputs,
     tonemap: str,
-    settings: FitSettings,
     report: Path | None = None,
     remarks: Sequence[str] = (),
-    warm_start: Model | None = None,
     save_model: Path | None = None,
-    frame: Callable[[RenderBuffers], FitResult] | None = None,
 ) -> None:
-    """Denoise a render and write the result beside its own files.
+    """Write a denoised render beside its own files.
 
-    Writes ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked for,
-    the report and the fitted network. ``remarks`` are lines on the render for the report. ``frame`` denoises
-    one of several frames; settings and warm start are then its own affair.
+    These are ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked
+    for, the report and the fitted network. ``remarks`` are lines on the render for the report.
     """
-    result = frame(buffers) if frame else denoise_with_progress(buffers, settings, warm_start)
     exr, png, pair = _denoised_paths(outputs)
     noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))
     write_denoised(exr, result, buffers)
@@ -112,22 +106,21 @@ def _run(arguments: Sequence[str] | None) -> None:
 
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
+    denoise, seeds = None, [options.seed] * len(options.scenes)
     if options.dip_denoise:
         check_ready(settings, warm_start)
-    follower = None
-    if options.dip_denoise and len(options.scenes) > 1 and settings.preset != "paper":
-        with held_interrupts():
-            from tungsten_dip.sequence.following import Follower, Models
-
-        follower = Follower(settings, models=Models(first=warm_start))
+        if len(options.scenes) > 1 and settings.preset != "paper":
+            denoise = _frame_after_frame(settings, warm_start)
+            # The same noise in every frame would not average out.
+            seeds = [options.seed, *((options.seed or 0) + index for index in range(1, len(seeds)))]
+        else:
+            denoise = _each_alone(settings, warm_start)
     failed = 0
     denoised: set[Path] = set()
-    for index, path in enumerate(options.scenes):
-        # The same noise in every frame would not average out.
-        seed = options.seed if index == 0 or follower is None else (options.seed or 0) + index
-        of_frame = argparse.Namespace(**{**vars(options), "seed": seed})
+    for path, seed in zip(options.scenes, seeds, strict=True):
+        of_scene = argparse.Namespace(**{**vars(options), "seed": seed})
         try:
-            _render_scene(path, host, of_frame, settings, warm_start, follower, denoised)
+            _render_scene(path, host, of_scene, settings, denoise, denoised)
         except InputError as error:
             if len(options.scenes) == 1:
                 raise
@@ -182,18 +175,36 @@ def _render_scene(
     host: str,
     options: argparse.Namespace,
     settings: FitSettings,
-    warm_start: Model | None,
-    follower: Follower | None,
+    denoise: Denoise | None,
     denoised: set[Path],
 ) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
 
-    With ``follower``, the scene is one of several frames. ``denoised`` are the denoised pictures of the
-    scenes before, to which this one's are added.
+    ``denoised`` are the denoised pictures of the scenes before, to which this one's are added.
 
     Raises InputError if the scene would write over one of those, or as whatever is called here does.
     """
     scene = load_scene(path, options.input_directory)
+    outputs = _checked_outputs(scene, path, options, denoised)
+    with remarks_from_log() as remarks:
+        with progress_on_stderr(f"rendering {path.name}") as progress:
+            if host == "tungsten":
+                buffers, unwritten = _render_with_tungsten(path, outputs, options, settings, progress)
+            else:
+                buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
+        write_render(buffers, unwritten, scene.camera.tonemap)
+        for written in filter(None, (outputs.ldr, outputs.hdr)):
+            log.info("wrote %s", written)
+        if denoise is not None:
+            result = denoise(scene.camera, buffers)
+            tonemap = scene.camera.tonemap
+            write_outputs(result, buffers, outputs, tonemap, options.report, remarks, options.save_model)
+
+
+def _checked_outputs(
+    scene: Scene, path: Path, options: argparse.Namespace, denoised: set[Path]
+) -> SceneOutputs:
+    """Return what a scene writes, all of which can be written."""
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
@@ -203,7 +214,8 @@ def _render_scene(
         options.output_file,
         options.hdr_output_file,
     )
-    left = outputs = outputs.with_both_pictures() if options.dip_denoise else outputs
+    if options.dip_denoise:
+        outputs = outputs.with_both_pictures()
     outputs.check()
     if options.dip_denoise:
         for derived in _denoised_paths(outputs):
@@ -218,36 +230,25 @@ def _render_scene(
         check_writable(options.report, (".html",))
     if options.save_model is not None:
         check_writable(options.save_model, (".onnx",))
+    return outputs
 
-    with remarks_from_log() as remarks:
-        with progress_on_stderr(f"rendering {path.name}") as progress:
-            if host == "tungsten":
-                preview = _preview(outputs, settings) if options.dip_preview else None
-                before = _last_written(outputs.hdr)
-                rendered = tungsten_host.drive(path, _driver_options(options), preview, progress)
-                buffers = rendered.buffers
-                left = SceneOutputs(
-                    ldr=None if rendered.output_file else outputs.ldr,
-                    # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
-                    hdr=None if _last_written(outputs.hdr) != before else outputs.hdr,
-                )
-            else:
-                buffers = _render_with_mitsuba(scene, options, progress)
-        write_render(buffers, left, scene.camera.tonemap)
-        for written in filter(None, (outputs.ldr, outputs.hdr)):
-            log.info("wrote %s", written)
-        if options.dip_denoise:
-            denoise_outputs(
-                buffers,
-                outputs,
-                scene.camera.tonemap,
-                settings,
-                options.report,
-                remarks,
-                warm_start,
-                options.save_model,
-                None if follower is None else partial(_follow, follower, scene.camera),
-            )
+
+def _render_with_tungsten(
+    path: Path,
+    outputs: SceneOutputs,
+    options: argparse.Namespace,
+    settings: FitSettings,
+    progress: Progress,
+) -> tuple[RenderBuffers, SceneOutputs]:
+    """Render a scene; return its buffers, and what Tungsten has not written of its outputs."""
+    preview = _preview(outputs, settings) if options.dip_preview else None
+    before = _last_written(outputs.hdr)
+    rendered = tungsten_host.drive(path, _driver_options(options), preview, progress)
+    return rendered.buffers, SceneOutputs(
+        ldr=None if rendered.output_file else outputs.ldr,
+        # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
+        hdr=None if _last_written(outputs.hdr) != before else outputs.hdr,
+    )
 
 
 def _last_written(path: Path | None) -> int | None:
@@ -255,13 +256,25 @@ def _last_written(path: Path | None) -> int | None:
     return path.stat().st_mtime_ns if path is not None and path.exists() else None
 
 
-def _follow(follower: Follower, camera: Camera, buffers: RenderBuffers) -> FitResult:
-    """Denoise a frame, starting from the one before."""
-    known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
-    if known is None:
-        log.info("frames of this camera cannot be moved into place, and do not help one another")
-    with progress_on_stderr("denoising") as progress:
-        return follower.denoise(buffers, known, progress).result
+def _each_alone(settings: FitSettings, warm_start: Model | None) -> Denoise:
+    return lambda _, buffers: denoise_with_progress(buffers, settings, warm_start)
+
+
+def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoise:
+    """Return what denoises scenes as frames, each starting from the one before."""
+    with held_interrupts():
+        from tungsten_dip.sequence.following import Follower, Models
+
+    follower = Follower(settings, models=Models(first=warm_start))
+
+    def denoise(camera: Camera, buffers: RenderBuffers) -> FitResult:
+        known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
+        if known is None:
+            log.info("frames of this camera cannot be moved into place, and do not help one another")
+        with progress_on_stderr("denoising") as progress:
+            return follower.denoise(buffers, known, progress).result
+
+    return denoise
 
 
 def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten_host.Rendered], None]:
