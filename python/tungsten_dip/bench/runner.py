@@ -12,7 +12,7 @@ from tungsten_dip.bench.machine import machine_key
 from tungsten_dip.bench.methods import Method, Outcome
 from tungsten_dip.bench.results import Key, Measurement, Results
 from tungsten_dip.bench.sets import BenchSet
-from tungsten_dip.buffers import FloatImage, read_image, replacing, write_image
+from tungsten_dip.buffers import FloatImage, read_image, write_image, write_text
 from tungsten_dip.errors import InputError
 from tungsten_dip.interrupts import heeded_interrupts
 from tungsten_dip.progress import Progress
@@ -84,8 +84,7 @@ class Runner:
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file into the folder, whole or not at all."""
-        with replacing(self._folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(self._folder / name, text)
 
     def _key(self, task: Task, label: str) -> Key:
         bench_set, settings = task.bench_set, task.method.settings

@@ -1,6 +1,6 @@
 """Buffers of a render: the data model, files, mending, statistics of the noise, pre-filtering of features."""
 
-from tungsten_dip.buffers.atomic import check_writable, replacing
+from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, RenderBuffers
@@ -27,5 +27,6 @@ __all__ = [
     "sanitize",
     "write_denoised",
     "write_image",
+    "write_text",
     "write_tungsten_folder",
 ]

@@ -41,6 +41,15 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8, whole or not at all.
+
+    Raises InputError if the file system refuses.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
     """Check before long work that its result can be saved as ``path``.
 

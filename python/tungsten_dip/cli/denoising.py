@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_type_hints
 
-from tungsten_dip.buffers import RenderBuffers, replacing
+from tungsten_dip.buffers import RenderBuffers, write_text
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, check_settings
@@ -101,9 +101,7 @@ def write_report(
     """Write the HTML page whole or not at all."""
     from tungsten_dip.report.page import report_page  # imports all of the scene layer
 
-    page = report_page(title, buffers, result, tonemap, remarks)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, report_page(title, buffers, result, tonemap, remarks))
 
 
 def _name_and_channel(text: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tungsten_dip.buffers import check_writable, replacing
+from tungsten_dip.buffers import check_writable, write_text
 from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.console import add_json, add_threads, progress_on_stderr
 from tungsten_dip.cli.denoising import (
@@ -171,9 +171,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
 def _write_report(path: Path, title: str, records: Sequence[Record]) -> None:
     from tungsten_dip.sequence.page import sequence_page
 
-    page = sequence_page(title, records, TONEMAP)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, sequence_page(title, records, TONEMAP))
 
 
 def _refit(text: str) -> int | str:
