@@ -54,6 +54,8 @@ int run_python(int argc, char** argv) {
 
     PyConfig config;
     PyConfig_InitPythonConfig(&config);
+    // The current folder, which may hold a scene from anywhere, is no place to import from.
+    config.safe_path = 1;
     // A virtual environment is found from the name of its interpreter.
     PyStatus status = PyConfig_SetBytesString(&config, &config.program_name, python.c_str());
     if (PyStatus_Exception(status) == 0)

@@ -394,6 +394,22 @@ def test_the_native_command_runs_the_package_and_fails_in_one_line(tmp_path):
     assert "Traceback" not in result.stderr
 
 
+def test_the_native_command_runs_no_code_beside_the_scene(tmp_path):
+    for module in ("json", "logging"):
+        (tmp_path / f"{module}.py").write_text("open('ran', 'w')")
+    result = subprocess.run(
+        [tungsten.executable(), "--dip-denoise", "missing.json"],
+        cwd=tmp_path,
+        env={**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert not (tmp_path / "ran").exists()
+    assert result.returncode == 2
+    assert "missing.json" in result.stderr
+
+
 @in_process
 def test_evidence_that_is_taken_is_gone(write_scene):
     session = tungsten._load(write_scene(), tungsten.DriverOptions(spp=1))
