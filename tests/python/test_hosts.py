@@ -14,6 +14,7 @@ from tungsten_dip import hosts
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts import tungsten
+from tungsten_dip.scene import load_scene
 
 
 @pytest.fixture
@@ -77,6 +78,16 @@ def test_tungsten_reads_the_scene_itself(tmp_path: Path, monkeypatch: pytest.Mon
     assert hosts.render(path) == path
     with pytest.raises(InputError, match="expected a file"):
         hosts.render(path, host="mitsuba")
+
+
+@pytest.mark.parametrize("folder", [None, "elsewhere"])
+def test_tungsten_looks_for_files_where_the_scene_was_read_with_them(
+    folder: str | None, scene_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    input_directory = folder and scene_path.parent / folder
+    monkeypatch.setattr(tungsten, "render", lambda path, **options: (path, options["input_directory"]))
+    rendered: Any = hosts.render(load_scene(scene_path, input_directory), host="tungsten")
+    assert rendered == (scene_path, input_directory)
 
 
 def test_unknown_host(scene_path: Path) -> None:

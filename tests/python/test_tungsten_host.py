@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tungsten_dip.buffers import read_image
+from tungsten_dip import hosts
+from tungsten_dip.buffers import read_image, write_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult
 from tungsten_dip.hosts import tungsten
+from tungsten_dip.scene import load_scene
 
 ROOT, BUILD = os.environ.get("Tungsten_ROOT"), os.environ.get("Tungsten_BUILD")  # noqa: SIM112
 pytestmark = [
@@ -196,6 +198,24 @@ def test_going_through_the_native_command_gives_the_same_buffers(write_scene, mo
     for name, buffer in direct.quantities():
         for plane, array in buffer.planes():
             np.testing.assert_array_equal(getattr(getattr(through, name), plane), array)
+
+
+@pytest.mark.parametrize("through_command", [False, True])
+def test_files_are_looked_for_where_the_scene_was_read_with_them(
+    write_scene, tmp_path, monkeypatch, through_command
+):
+    if through_command:
+        monkeypatch.setattr(tungsten, "_module", lambda: None)
+    elif not tungsten.in_process():
+        pytest.skip("Tungsten's libraries are not position-independent")
+    path, textures = write_scene(), tmp_path / "textures"
+    scene = json.loads(path.read_text())
+    scene["bsdfs"][0]["albedo"] = scene["bsdfs"][1]["albedo"] = "color.pfm"
+    path.write_text(json.dumps(scene))
+    textures.mkdir()
+    write_image(textures / "color.pfm", np.full((2, 2, 3), (0.125, 0.25, 0.5), np.float32))
+    albedo = hosts.render(load_scene(path, textures), host="tungsten", spp=2, seed=1).albedo.mean
+    np.testing.assert_array_equal(albedo[-1], np.tile(np.float32([0.125, 0.25, 0.5]), (40, 1)))
 
 
 @pytest.mark.parametrize("through_command", [False, True])

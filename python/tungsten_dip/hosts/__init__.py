@@ -44,12 +44,14 @@ def render(
 
     if host == "auto":
         host = "tungsten" if tungsten.available() else "mitsuba"
-    path = scene.path if isinstance(scene, Scene) else scene
+    path, folder = (scene.path, scene.input_directory) if isinstance(scene, Scene) else (scene, None)
     _log.info("%s: rendered by %s", path, host.capitalize())
     with _RENDERING:
         if host == "tungsten":
             # Which may know more than `load_scene`.
-            return tungsten.render(path, spp=spp, seed=seed, threads=threads, progress=progress)
+            return tungsten.render(
+                path, spp=spp, seed=seed, threads=threads, input_directory=folder, progress=progress
+            )
         if not isinstance(scene, Scene):
             scene = load_scene(scene)
         return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)

@@ -107,17 +107,19 @@ def render(
     spp: int | None = None,
     seed: int | None = None,
     threads: int | None = None,
+    input_directory: str | Path | None = None,
     progress: Progress = silent,
 ) -> RenderBuffers:
     """Render a scene and return its buffers; writes no file.
 
-    None takes the scene's ``spp``, the stock command's seed and all cores but one. The sampler is the
-    independent one whatever the scene says: with Tungsten's default the halves A and B would not be
-    independent.
+    None takes the scene's ``spp``, the stock command's seed, all cores that this process may run on, and the
+    files beside the scene. The sampler is the independent one whatever the scene says: with Tungsten's
+    default the halves A and B would not be independent.
 
     Raises InputError if Tungsten cannot load or render the scene, or is not there.
     """
-    options = DriverOptions(spp=spp, seed=seed, threads=threads)
+    folder = None if input_directory is None else Path(input_directory)
+    options = DriverOptions(spp=spp, seed=seed, threads=threads, input_directory=folder)
     if _module() is None:
         return _render_in_child(Path(scene_path), options, progress)
     session = _load(Path(scene_path), options)
@@ -209,7 +211,8 @@ _INTERRUPTED = (130, -signal.SIGINT)
 
 def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) -> RenderBuffers:
     command = _require_executable()
-    given = {name: value for name, value in asdict(options).items() if name in ("spp", "seed", "threads")}
+    names = ("spp", "seed", "threads", "input_directory")
+    given = {name: value for name, value in asdict(options).items() if name in names}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         read_end, write_end = os.pipe()
         lines = stack.enter_context(os.fdopen(read_end))
@@ -220,7 +223,7 @@ def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) ->
                 folder,
                 str(write_end),
                 str(scene),
-                json.dumps(given),
+                json.dumps(given, default=str),
             ]
             child = stack.enter_context(subprocess.Popen(program, env=_environment(), pass_fds=[write_end]))
         try:

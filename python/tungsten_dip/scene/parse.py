@@ -93,9 +93,8 @@ def load_scene(path: Path | str, input_directory: Path | str | None = None) -> S
     """
     path = Path(path)
     raw = object_from_json_file(path)
-    folder = Path(input_directory) if input_directory is not None else path.parent
     try:
-        return _Parser(path, folder).scene(raw)
+        return _Parser(path, None if input_directory is None else Path(input_directory)).scene(raw)
     except RecursionError:
         raise InputError(f"{path}: objects are nested too deeply; flatten the scene") from None
 
@@ -150,9 +149,10 @@ class _MissingFileError(InputError):
 class _Parser:
     """The state of one reading: what can be named so far, and what was ignored."""
 
-    def __init__(self, path: Path, folder: Path) -> None:
+    def __init__(self, path: Path, input_directory: Path | None) -> None:
         self.path = path
-        self.folder = folder
+        self.input_directory = input_directory
+        self.folder = path.parent if input_directory is None else input_directory
         self.named: dict[type, dict[str, Any]] = {Bsdf: {}, Medium: {}}
         self.missing: list[_MissingFileError] = []
         self.nested_bsdfs: dict[Bsdf, int] = {}
@@ -200,7 +200,7 @@ class _Parser:
             logger.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
         for error in self.missing:
             logger.warning("%s (ignored: nothing uses it)", error)
-        return Scene(path=self.path, **parts)
+        return Scene(path=self.path, input_directory=self.input_directory, **parts)
 
     # --- Values by annotation ---
 

@@ -959,9 +959,13 @@ class Renderer:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A scene file; ``path`` is where it was read from."""
+    """A scene file; ``path`` is where it was read from, ``input_directory`` where the files it names are.
+
+    None: beside it.
+    """
 
     path: Path
+    input_directory: Path | None = None
     media: tuple[Medium, ...] = ()
     bsdfs: tuple[Bsdf, ...] = ()
     primitives: tuple[Primitive, ...] = ()
