@@ -78,11 +78,13 @@ void bind(const py::module_& module) {
 
     py::class_<Render>(module, "Render",
                        "A loaded scene that is rendered pass by pass; one at a time per process.")
-        .def(py::init([](const std::string& scene, int threads, std::optional<std::uint32_t> spp,
-                         std::optional<std::uint32_t> seed, std::string input_directory,
-                         std::string output_directory, std::string output_file, std::string hdr_output_file) {
+        .def(py::init([](const std::string& scene, int threads, std::optional<std::uint64_t> max_pixels,
+                         std::optional<std::uint32_t> spp, std::optional<std::uint32_t> seed,
+                         std::string input_directory, std::string output_directory, std::string output_file,
+                         std::string hdr_output_file) {
                  return std::make_unique<Render>(
                      scene, RenderOptions{.threads = threads,
+                                          .max_pixels = max_pixels,
                                           .spp = spp,
                                           .seed = seed,
                                           .input_directory = std::move(input_directory),
@@ -90,11 +92,12 @@ void bind(const py::module_& module) {
                                           .output_file = std::move(output_file),
                                           .hdr_output_file = std::move(hdr_output_file)});
              }),
-             py::arg("scene"), py::kw_only(), py::arg("threads") = 0, py::arg("spp") = py::none(),
-             py::arg("seed") = py::none(), py::arg("input_directory") = "", py::arg("output_directory") = "",
-             py::arg("output_file") = "", py::arg("hdr_output_file") = "",
+             py::arg("scene"), py::kw_only(), py::arg("threads") = 0, py::arg("max_pixels") = py::none(),
+             py::arg("spp") = py::none(), py::arg("seed") = py::none(), py::arg("input_directory") = "",
+             py::arg("output_directory") = "", py::arg("output_file") = "", py::arg("hdr_output_file") = "",
              py::call_guard<py::gil_scoped_release>(),
-             "Load a scene. Raises RuntimeError, in one line, where Tungsten cannot.")
+             "Load a scene. Raises RuntimeError, in one line, where Tungsten cannot, and ValueError, "
+             "which says the size, for more than max_pixels.")
         .def_property_readonly("plan", &Render::plan, py::return_value_policy::copy)
         .def_property_readonly("current_spp", &Render::current_spp)
         .def_property_readonly("total_spp", &Render::total_spp)

@@ -15,6 +15,7 @@ namespace tungsten_dip {
 // it.
 struct RenderOptions {
     int threads = 0;  // 0: number of cores minus one, as the stock command
+    std::optional<std::uint64_t> max_pixels;
     std::optional<std::uint32_t> spp;
     std::optional<std::uint32_t> seed;
     std::string input_directory;
@@ -62,7 +63,8 @@ struct RenderPlan {
 
 // A loaded scene that asks for the evidence a fit needs: independent sampler, halves and variance of every
 // quantity the integrator writes. The scene's own buffer files are still written as the scene asks. One at a
-// time per process. Every method throws std::runtime_error (or what Tungsten throws) with a message in words.
+// time per process. Every method throws std::runtime_error (or what Tungsten throws) with a message in words;
+// the constructor std::length_error with the size of an image of more than `max_pixels`.
 class Render {
   public:
     Render(const std::string& scene, const RenderOptions& options);

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from tungsten_dip import hosts
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.hosts import tungsten
+from tungsten_dip.hosts import memory, tungsten
 from tungsten_dip.scene import load_scene
 
 
@@ -88,6 +89,32 @@ def test_tungsten_looks_for_files_where_the_scene_was_read_with_them(
     monkeypatch.setattr(tungsten, "render", lambda path, **options: (path, options["input_directory"]))
     rendered: Any = hosts.render(load_scene(scene_path, input_directory), host="tungsten")
     assert rendered == (scene_path, input_directory)
+
+
+def test_a_picture_that_does_not_fit_into_memory_is_refused(
+    scene_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene(scene_path)
+    monkeypatch.setattr(memory, "_available_bytes", lambda: 15 * 1000)
+    hosts.render(scene, host="mitsuba", spp=1)  # 5 x 3 pixels of less than 1000 bytes
+    monkeypatch.setattr(memory, "_available_bytes", lambda: 15 * 4 * 34)
+    with pytest.raises(InputError, match=f"{scene_path}: expected at most 3 pixels, .* got 5 x 3; lower"):
+        hosts.render(scene, host="mitsuba", spp=1)
+
+
+def test_colour_alone_takes_less_memory(scene_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(scene_path)
+    monkeypatch.setattr(memory, "_available_bytes", lambda: 15 * 400)
+    memory.check_fits_mitsuba(scene, ["color"])
+    with pytest.raises(InputError, match="lower the resolution"):
+        memory.check_fits_mitsuba(scene, ["color", "albedo", "normal", "depth"])
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="the system does not tell its memory")
+def test_available_memory_is_a_part_of_the_whole() -> None:
+    available = memory._available_bytes()
+    assert available is not None
+    assert 0 < available < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def test_unknown_host(scene_path: Path) -> None:

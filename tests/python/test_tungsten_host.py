@@ -20,7 +20,7 @@ from tungsten_dip.buffers import read_image, write_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult
-from tungsten_dip.hosts import tungsten
+from tungsten_dip.hosts import memory, tungsten
 from tungsten_dip.scene import load_scene
 
 ROOT, BUILD = os.environ.get("Tungsten_ROOT"), os.environ.get("Tungsten_BUILD")  # noqa: SIM112
@@ -238,6 +238,16 @@ def test_a_scene_that_cannot_be_loaded_is_one_line(write_scene, tmp_path, monkey
         tungsten.render(tmp_path / "missing.json")
     with pytest.raises(InputError, match="spp"):
         tungsten.render(write_scene(), spp=0)
+
+
+@in_process
+def test_a_picture_that_does_not_fit_into_memory_is_refused(write_scene, monkeypatch):
+    path = write_scene(camera={"resolution": [65536, 65536]})  # as 32 bits count: none
+    with pytest.raises(InputError, match="got 65536 x 65536; lower the resolution"):
+        tungsten.render(path)
+    monkeypatch.setattr(memory, "_available_bytes", lambda: 959 * 240)
+    with pytest.raises(InputError, match=r"expected at most 959 pixels, .* got 40 x 24"):
+        tungsten.render(write_scene())
 
 
 @in_process

@@ -27,6 +27,7 @@ import numpy as np
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.progress import Progress, silent
 
 _log = logging.getLogger(__name__)
@@ -262,10 +263,18 @@ def _load(scene: Path, options: DriverOptions) -> Any:
         raise InputError(f"{scene}: expected a scene file, found none; check the path")
     names = ("input_directory", "output_directory", "output_file", "hdr_output_file")
     paths = {name: str(getattr(options, name) or "") for name in names}
+    max_pixels = pixels_that_fit(TUNGSTEN_BYTES_PER_PIXEL)
     try:
         return module.Render(
-            str(scene), threads=thread_count(options.threads), spp=options.spp, seed=options.seed, **paths
+            str(scene),
+            threads=thread_count(options.threads),
+            max_pixels=max_pixels,
+            spp=options.spp,
+            seed=options.seed,
+            **paths,
         )
+    except ValueError as size:
+        raise too_large(scene, str(size), max_pixels) from None
     except RuntimeError as error:
         raise InputError(
             f"{scene}: Tungsten cannot load it ({error}); check the scene and the files that it names"

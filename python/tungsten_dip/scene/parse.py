@@ -56,7 +56,7 @@ from tungsten_dip.scene.types import (
 logger = logging.getLogger(__name__)
 
 MAX_PIXELS = 2**28
-"""Largest image accepted: 3 GiB for its colour alone."""
+"""Largest image accepted; whether there is memory for it, a host says that renders it."""
 
 MAX_NESTED_BSDFS = 256
 """BSDFs that one BSDF may be made of, counting what it names as often as it does.
