@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.scene import meshes
 from tungsten_dip.scene.meshes import (
     CurveSet,
     TriangleMesh,
@@ -125,6 +126,41 @@ def test_smooth_normals_cross_a_seam_of_equal_positions():
     smooth = with_smooth_normals(mesh_of(points, [[0, 1, 2], [3, 5, 4]]))
     np.testing.assert_allclose(smooth.normals[0], smooth.normals[3], atol=1e-6)
     np.testing.assert_allclose(smooth.normals[0], [np.sin(tilt / 2), np.cos(tilt / 2), 0], atol=1e-6)
+
+
+def test_smooth_normals_of_many_vertices_at_one_place(monkeypatch):
+    """Tents that meet at their tips, each with a tip of its own: all tips have one normal."""
+    count = 9
+    angle = np.linspace(0, 2 * np.pi, count + 1)
+    ring = np.stack([np.cos(angle), np.full(count + 1, -0.2), np.sin(angle)], axis=1)
+    points = np.concatenate([[[0, 0, 0], ring[i + 1], ring[i]] for i in range(count)])
+    mesh = mesh_of(points, np.arange(3 * count))
+    at_once = with_smooth_normals(mesh)
+    np.testing.assert_allclose(at_once.normals[::3], [[0, 1, 0]] * count, atol=1e-6)
+    for pairs in (1, 5, count * count):
+        monkeypatch.setattr(meshes, "_NORMAL_PAIRS_AT_ONCE", pairs)
+        np.testing.assert_allclose(with_smooth_normals(mesh).normals, at_once.normals, atol=1e-6)
+
+
+def test_smooth_normals_take_little_memory_however_many_vertices_share_a_place():
+    count = 3000
+    mesh = mesh_of(np.zeros((count, 3)), np.arange(count))
+    tracemalloc.start()
+    try:
+        assert len(with_smooth_normals(mesh).normals) == count
+        assert tracemalloc.get_traced_memory()[1] < 200 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_smooth_normals_of_too_many_vertices_at_one_place_are_refused():
+    count = 3 * 4096
+    with pytest.raises(InputError, match="merge them or set recompute_normals to false"):
+        with_smooth_normals(mesh_of(np.zeros((count, 3)), np.arange(count)))
+
+
+def test_smooth_normals_of_nothing():
+    assert with_smooth_normals(mesh_of(np.zeros((0, 3)), [])).normals.shape == (0, 3)
 
 
 def test_smooth_normals_of_a_face_without_area_are_finite():

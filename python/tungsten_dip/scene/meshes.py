@@ -28,7 +28,10 @@ SPLIT_COSINE = float(np.cos(0.15 * np.pi))
 """Faces that meet more sharply than this (27 degrees) keep an edge when normals are computed."""
 
 MAX_NORMAL_PAIRS = 2**27
-"""Pairs of a corner and a vertex at one place that computing normals may visit: a few GiB."""
+"""Pairs of a corner and a vertex at one place that computing normals may visit: bounds the time."""
+
+_NORMAL_PAIRS_AT_ONCE = 2**20
+"""Bounds the memory: some 100 MiB."""
 
 _FIBER_MAGIC = bytes([0x80, 0xBF, 0x80, 0x46, 0x49, 0x42, 0x45, 0x52])
 
@@ -190,18 +193,19 @@ def _summed_at_equal_places(
             f"mesh: expected at most {MAX_NORMAL_PAIRS} pairs of coincident vertices, got {total}; "
             "merge them or set recompute_normals to false"
         )
-    pair_corner = np.repeat(np.arange(len(corners)), vertices_there)
-    number = np.arange(total) - np.repeat(np.cumsum(vertices_there) - vertices_there, vertices_there)
-    pair_vertex = by_place[start[place[corners]][pair_corner] + number]
-    pair_face = face[pair_corner]
-    smooth = np.einsum("ij,ij->i", reference[pair_vertex], unit[pair_face]) >= SPLIT_COSINE
-    return np.stack(
-        [
-            np.bincount(pair_vertex[smooth], weighted[pair_face[smooth], axis], minlength=len(positions))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    pairs_before = np.cumsum(vertices_there) - vertices_there
+    sums = np.zeros_like(positions)
+    steps = np.arange(_NORMAL_PAIRS_AT_ONCE, total, _NORMAL_PAIRS_AT_ONCE)
+    for part in np.split(np.arange(len(corners)), np.searchsorted(pairs_before, steps)):
+        pair_corner = np.repeat(part, vertices_there[part])
+        number = np.arange(len(pair_corner)) - (pairs_before[pair_corner] - pairs_before[part[:1]])
+        pair_vertex = by_place[start[place[corners[pair_corner]]] + number]
+        pair_face = face[pair_corner]
+        smooth = np.einsum("ij,ij->i", reference[pair_vertex], unit[pair_face]) >= SPLIT_COSINE
+        for axis in range(3):
+            values = weighted[pair_face[smooth], axis]
+            sums[:, axis] += np.bincount(pair_vertex[smooth], values, minlength=len(positions))
+    return sums
 
 
 def _bytes_of(path: Path) -> bytes:
