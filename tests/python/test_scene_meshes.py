@@ -224,20 +224,21 @@ def test_normals_that_are_not_finite_are_mended_and_said(tmp_path, caplog):
 # --- Curves ---
 
 
-def fiber(nodes, counts, *, with_width=True):
-    """Write curves as Tungsten's .fiber does."""
+def fiber_attribute(name, data, flags, kind, per_element):
+    name = name.encode() + b"\0"
+    return struct.pack("<QQHBB", 20 + len(name), len(data), flags, kind, per_element) + name + data
 
-    def attribute(name, data, flags, kind, per_element):
-        name = name.encode() + b"\0"
-        return struct.pack("<QQHBB", 20 + len(name), len(data), flags, kind, per_element) + name + data
 
+def fiber(nodes, counts, *, with_width=True, more=b""):
+    """Write curves as Tungsten's .fiber does, and ``more`` attributes behind them."""
+    attribute = fiber_attribute
     content = b"\x80\xbf\x80FIBER" + struct.pack("<HHIQQQ", 1, 0, 0, 40, len(nodes), len(counts))
     content += attribute("num_vertices", np.asarray(counts, "<u2").tobytes(), 1, 3, 1)
     content += attribute("unknown", b"12345", 0, 0, 1)
     content += attribute("position", np.asarray(nodes, "<f4")[:, :3].tobytes(), 0, 8, 3)
     if with_width:
         content += attribute("width", np.asarray(nodes, "<f4")[:, 3].tobytes(), 0, 8, 1)
-    return content + struct.pack("<Q", 0)
+    return content + more + struct.pack("<Q", 0)
 
 
 NODES = np.random.default_rng(5).random((7, 4), np.float32)
@@ -257,6 +258,28 @@ def test_fiber_repeats_the_last_value_of_a_short_attribute(tmp_path):
     # Two curves are declared but only one count is given.
     path.write_bytes(content[:32] + struct.pack("<Q", 2) + content[40:])
     assert read_curves(path).ends.tolist() == [3, 6]
+
+
+OTHERS = np.full((7, 3), 9, "<f4").tobytes()
+
+
+@pytest.mark.parametrize(
+    "attribute",
+    [
+        ("position", OTHERS, 1, 8, 3),  # of every curve
+        ("position", OTHERS, 0, 4, 3),  # whole numbers
+        ("position", OTHERS, 0, 8, 4),
+        ("width", OTHERS, 0, 9, 1),  # doubles
+        ("width", b"", 0, 8, 1),
+        ("num_vertices", OTHERS, 0, 3, 1),
+    ],
+)
+def test_fiber_attributes_of_another_kind_are_passed_over(tmp_path, attribute):
+    path = tmp_path / "c.fiber"
+    path.write_bytes(fiber(NODES, [3, 4], more=fiber_attribute(*attribute)))
+    curves = read_curves(path)
+    np.testing.assert_array_equal(curves.nodes, NODES)
+    assert curves.ends.tolist() == [3, 7]
 
 
 @pytest.mark.parametrize("present", [0b111, 0b011, 0b110])

@@ -329,24 +329,29 @@ def _curves_from_fiber(path: Path, content: bytes) -> CurveSet:
         raise InputError(f"{path}: expected fibers in the file, got another content; export the curves again")
     header_length, node_count, curve_count = (file.take_int("<u8") for _ in range(3))
 
-    dtypes = {"num_vertices": np.dtype("<u2"), "position": np.dtype(("<f4", 3)), "width": np.dtype("<f4")}
+    # By name, whether it is of every curve (or every node), the number of its type, values per element.
+    dtypes = {
+        ("num_vertices", True, 3, 1): np.dtype("<u2"),
+        ("position", False, 8, 3): np.dtype(("<f4", 3)),
+        ("width", False, 8, 1): np.dtype("<f4"),
+    }
     attributes: dict[str, npt.NDArray[Any]] = {}
     offset = header_length
     while descriptor_length := (file := _Bytes(path, content, offset)).take_int("<u8"):
         data_length = file.take_int("<u8")
-        # Flags, type of value and values per element follow; the names fix all three.
-        name_start = file.offset + 4
-        name = content[name_start : content.find(b"\0", name_start)].decode("latin-1")
+        per_curve = bool(file.take_int("<u2") & 1)
+        value_type, values_per_element = file.take("u1", 2).tolist()
+        name = content[file.offset : content.find(b"\0", file.offset)].decode("latin-1")
         offset += descriptor_length
-        if name in dtypes:
-            attributes[name] = _Bytes(path, content, offset).take(
-                dtypes[name], data_length // dtypes[name].itemsize
-            )
+        # An attribute of another kind is passed over, as in Tungsten, and so is one without values.
+        dtype = dtypes.get((name, per_curve, value_type, values_per_element))
+        if dtype is not None and data_length >= dtype.itemsize:
+            attributes[name] = _Bytes(path, content, offset).take(dtype, data_length // dtype.itemsize)
         offset += data_length
 
     def values(name: str, count: int) -> npt.NDArray[Any]:
         # The file cannot hold more nodes than bytes, however many it claims.
-        if name not in attributes or len(attributes[name]) == 0 or count > len(content):
+        if name not in attributes or count > len(content):
             raise InputError(f"{path}: expected {count} values of {name}; export the curves again")
         given = attributes[name][:count]
         return np.concatenate([given, np.repeat(given[-1:], count - len(given), axis=0)])
