@@ -116,19 +116,19 @@ def effects_of(scene: Scene) -> Effects:
         media.append(scene.camera.medium)
     textured: list[Bsdf | Primitive] = [
         *bsdfs,
-        *(primitive for primitive in primitives if _shines(primitive)),
+        *(primitive for primitive in primitives if _may_shine(primitive)),
     ]
     aperture = scene.camera.aperture_size if isinstance(scene.camera, ThinlensCamera) else 0.0
     return Effects(
         depth_of_field=(f"camera (aperture {aperture:g})",) if aperture > 0.0 else (),
         glossy_reflection=_names(b for b in bsdfs if isinstance(b, _GLOSSY)),
         specular_transport=_names(b for b in bsdfs if isinstance(b, _SPECULAR)),
-        transmission=_names(b for b in bsdfs if _transmits(b)),
+        transmission=_names(b for b in bsdfs if _lets_light_in(b)),
         transparency=_names(b for b in bsdfs if _is_crossed_unbent(b)),
         participating_media=_names(m for m in media if not _is_empty(m)),
         hair=_names(p for p in primitives if isinstance(p, Curves)),
         textures=_names(o for o in textured if any(_varies(t) for t in _textures(o))),
-        environment_light=_names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _shines(p)),
+        environment_light=_names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _may_shine(p)),
         max_bounces=scene.integrator.max_bounces,
     )
 
@@ -232,7 +232,7 @@ def _reasons_without_information(scene: Scene, effects: Effects) -> dict[str, st
         if not effects.environment_light:
             reasons["albedo"] = "nothing is in the scene"
         return reasons
-    if effects.environment_light or any(_shines(surface) for surface in surfaces):
+    if effects.environment_light or any(_may_shine(surface) for surface in surfaces):
         # Emitters add their radiance to the albedo, and the sky is written as one.
         return reasons
     if any(isinstance(surface, MinecraftMap) for surface in surfaces):
@@ -294,7 +294,8 @@ def _varies(texture: Texture) -> bool:
     return _constant_value(texture) is None
 
 
-def _shines(primitive: Primitive) -> bool:
+def _may_shine(primitive: Primitive) -> bool:
+    """Whether a primitive is a light; an image is taken to hold some, as it is not read here."""
     if isinstance(primitive, Skydome):
         return primitive.intensity > 0.0
     return primitive.emitter is not None and _constant_value(primitive.emitter) != (0.0, 0.0, 0.0)
@@ -307,7 +308,8 @@ def _is_empty(medium: Medium) -> bool:
     return medium.density == 0.0 or not any((*medium.sigma_a, *medium.sigma_s))
 
 
-def _transmits(bsdf: Bsdf) -> bool:
+def _lets_light_in(bsdf: Bsdf) -> bool:
+    """Whether light crosses the surface and is bent or scattered there, whatever lies within the BSDF."""
     if isinstance(bsdf, DielectricBsdf | RoughDielectricBsdf):
         return bsdf.enable_refraction
     return isinstance(bsdf, DiffuseTransmissionBsdf)
