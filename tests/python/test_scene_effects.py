@@ -40,6 +40,7 @@ def filled_with(**fields):
 
 
 LAMBERT = {"type": "lambert"}
+LAMP = {"type": "point", "power": 1}
 
 # Effect, scenes that call for it, scenes that look much like it and do not.
 EFFECTS = {
@@ -113,12 +114,17 @@ EFFECTS = {
             {"primitives": [{"type": "infinite_sphere", "emission": 1}]},
             {"primitives": [{"type": "infinite_sphere_cap", "power": 1}]},
             {"primitives": [{"type": "skydome"}]},
+            # Where nothing shines, Tungsten adds a white sky.
+            {},
+            cube(emission=0),
+            {"primitives": [{"type": "infinite_sphere", "emission": 0}]},
+            {"primitives": [{"type": "instances", "masters": [{"type": "cube", "emission": 1}]}]},
         ],
         [
-            {"primitives": [{"type": "infinite_sphere", "emission": 0}]},
-            {"primitives": [{"type": "infinite_sphere"}]},
-            {"primitives": [{"type": "skydome", "intensity": 0}]},
-            {"primitives": [{"type": "point", "power": 1}]},
+            {"primitives": [{"type": "infinite_sphere", "emission": 0}, LAMP]},
+            {"primitives": [{"type": "infinite_sphere"}, LAMP]},
+            {"primitives": [{"type": "skydome", "intensity": 0}, LAMP]},
+            {"primitives": [LAMP]},
             cube(emission=1),
         ],
     ),
@@ -134,8 +140,8 @@ def test_every_effect_is_found_where_it_is_and_nowhere_else(load, effect):
         assert getattr(effects_of(load(scene)), effect) == (), scene
 
 
-def test_an_empty_scene_calls_for_nothing(load):
-    effects = effects_of(load({}))
+def test_a_scene_of_nothing_but_a_lamp_calls_for_nothing(load):
+    effects = effects_of(load({"primitives": [LAMP]}))
     assert all(getattr(effects, effect) == () for effect in EFFECTS)
 
 
@@ -190,6 +196,7 @@ GREY, RED = {"type": "lambert", "albedo": 0.5}, {"type": "lambert", "albedo": [0
         two(GREY, GREY, emission=1),
         two(GREY, {"type": "lambert", "albedo": "p.png"}),
         {"primitives": [*two(GREY, GREY)["primitives"], {"type": "skydome"}]},
+        two(GREY, GREY),  # under Tungsten's white sky
         two(GREY, {"type": "transparency", "base": RED}),
         {"primitives": [{"type": "mesh", "file": "m.wo3", "bsdf": [GREY, RED]}]},
     ],
@@ -201,18 +208,17 @@ def test_albedo_that_varies_is_asked_for(load, scene):
 
 
 @pytest.mark.parametrize(
-    "scene",
+    "other",
     [
-        two(GREY, GREY),
-        two(GREY, {"type": "oren_nayar", "albedo": 0.5}),
+        GREY,
+        {"type": "oren_nayar", "albedo": 0.5},
         # Mirrors and glass show what is behind them; Tungsten writes no albedo of theirs.
-        two(GREY, {"type": "mirror", "albedo": 0.9}),
-        two(GREY, {"type": "transparency", "albedo": 0.3, "base": GREY}),
-        {"primitives": [*two(GREY, GREY)["primitives"], {"type": "point", "power": 4}]},
+        {"type": "mirror", "albedo": 0.9},
+        {"type": "transparency", "albedo": 0.3, "base": GREY},
     ],
 )
-def test_albedo_of_one_colour_is_left_out(load, scene):
-    decision = decision_of(load(scene))
+def test_albedo_of_one_colour_is_left_out(load, other):
+    decision = decision_of(load({"primitives": [*two(GREY, other)["primitives"], LAMP]}))
     assert decision.features == ("normal", "depth")
     assert decision.buffers == ("color", "normal", "depth")
     assert decision.reasons["albedo"] == "one colour on every surface"
@@ -220,7 +226,8 @@ def test_albedo_of_one_colour_is_left_out(load, scene):
 
 def test_without_surfaces_only_the_sky_is_learned_from(load):
     assert decision_of(load({"primitives": [{"type": "skydome"}]})).features == ("albedo",)
-    assert decision_of(load({})).features == ()
+    assert decision_of(load({})).features == ("albedo",)
+    assert decision_of(load({"primitives": [LAMP]})).features == ()
 
 
 def test_the_decision_is_json_and_has_a_reason_for_everything(load):

@@ -61,6 +61,9 @@ _SPECULAR = (ConductorBsdf, DielectricBsdf, MirrorBsdf, PlasticBsdf, SmoothCoatB
 _ALWAYS_SPECULAR = (ConductorBsdf, DielectricBsdf, ForwardBsdf, MirrorBsdf, ThinSheetBsdf)
 _ENVIRONMENT = (InfiniteSphere, InfiniteSphereCap, Skydome)
 
+_DEFAULT_SKY = "white sky (no light is in the scene)"
+"""What Tungsten lights a scene with that has no light of its own."""
+
 
 @dataclass(frozen=True)
 class Effects:
@@ -118,6 +121,9 @@ def effects_of(scene: Scene) -> Effects:
         *bsdfs,
         *(primitive for primitive in primitives if _may_shine(primitive)),
     ]
+    environments = _names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _may_shine(p))
+    if not any(_may_shine(primitive) for primitive in scene.primitives):
+        environments = (_DEFAULT_SKY,)
     aperture = scene.camera.aperture_size if isinstance(scene.camera, ThinlensCamera) else 0.0
     return Effects(
         depth_of_field=(f"camera (aperture {aperture:g})",) if aperture > 0.0 else (),
@@ -128,7 +134,7 @@ def effects_of(scene: Scene) -> Effects:
         participating_media=_names(m for m in media if not _is_empty(m)),
         hair=_names(p for p in primitives if isinstance(p, Curves)),
         textures=_names(o for o in textured if any(_varies(t) for t in _textures(o))),
-        environment_light=_names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _may_shine(p)),
+        environment_light=environments,
         max_bounces=scene.integrator.max_bounces,
     )
 
