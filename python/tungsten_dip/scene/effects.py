@@ -1,13 +1,13 @@
-"""Which effects a scene calls for, and what follows from it.
+"""Which effects a scene calls for, and which buffers say something of it.
 
-Nothing else is simulated, written or learned from.
+That nothing else is simulated is for the hosts to see to: docs/scenes.md says how.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Any
 
 from tungsten_dip.scene.types import (
     AtmosphericMedium,
@@ -88,24 +88,10 @@ class Effects:
 
 @dataclass(frozen=True)
 class Decision:
-    """What is simulated, written and learned from.
+    """Which buffers a fit learns from, colour first, and why each is or is not among them."""
 
-    ``integrator`` is ``volpath`` with participating media alone. ``buffers`` are asked of the renderer;
-    ``features`` are those of them that will carry information. ``reasons`` says why, by the name of what was
-    decided.
-    """
-
-    integrator: Literal["path", "volpath"]
-    lens_samples: bool
-    environment_samples: bool
-    max_bounces: int
     buffers: tuple[BufferName, ...]
-    features: tuple[BufferName, ...]
-    reasons: dict[str, str]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the decision as plain objects for JSON."""
-        return asdict(self)
+    reasons: dict[BufferName, str]
 
 
 def effects_of(scene: Scene) -> Effects:
@@ -140,37 +126,17 @@ def effects_of(scene: Scene) -> Effects:
 
 
 def decision_of(scene: Scene) -> Decision:
-    """Return what a scene's effects mean for its rendering and its denoising."""
-    effects = effects_of(scene)
-    reasons = {
-        "integrator": "paths through volumes" if effects.participating_media else "no participating media",
-        "lens_samples": "depth of field" if effects.depth_of_field else "everything is in focus",
-        "environment_samples": (
-            "light from outside" if effects.environment_light else "no light comes from outside the scene"
-        ),
-        "color": "the image itself",
-        **_reasons_without_information(scene, effects),
-    }
-    if scene.integrator.kind != PathTracer.kind:
-        reasons["integrator"] += f"; in place of {scene.integrator.kind}, which writes no feature buffers"
-    features: list[BufferName] = []
+    """Return which buffers of a scene a fit learns from."""
+    left_out = _reasons_without_information(scene, effects_of(scene))
     informative: dict[BufferName, str] = {
+        "color": "the image itself",
         "albedo": "tells surfaces of different colours apart",
         "normal": "tells surfaces of different orientation apart",
         "depth": "tells near from far",
     }
-    for name, reason in informative.items():
-        if name not in reasons:
-            features.append(name)
-            reasons[name] = reason
     return Decision(
-        integrator="volpath" if effects.participating_media else "path",
-        lens_samples=bool(effects.depth_of_field),
-        environment_samples=bool(effects.environment_light),
-        max_bounces=effects.max_bounces,
-        buffers=("color", *features),
-        features=tuple(features),
-        reasons=reasons,
+        buffers=tuple(name for name in informative if name not in left_out),
+        reasons={**informative, **left_out},
     )
 
 
@@ -186,7 +152,7 @@ def inspect_facts(scene: Scene) -> dict[str, Any]:
         "integrator": scene.integrator.kind,
         "primitives": len(scene.primitives),
         "effects": asdict(effects_of(scene)),
-        "decision": decision_of(scene).to_json(),
+        "decision": asdict(decision_of(scene)),
     }
 
 
@@ -205,36 +171,26 @@ def inspect_text(scene: Scene) -> str:
         text = str(value) if isinstance(value, int) else _listed(value)
         lines.append(f"{field.name.replace('_', ' '):<21}{text}")
 
-    def row(name: str, value: str, reason: str) -> str:
-        return f"{name:<21}{value:<16}{reason}".rstrip()
-
-    lines += [
-        "",
-        row("what follows", "", "why"),
-        row("integrator", decision.integrator, decision.reasons["integrator"]),
-    ]
-    for name in ("lens_samples", "environment_samples"):
-        lines.append(
-            row(name.replace("_", " "), "yes" if getattr(decision, name) else "no", decision.reasons[name])
-        )
-    lines.append(row("buffers asked for", ", ".join(decision.buffers), ""))
-    for name in ("albedo", "normal", "depth", "visibility"):
-        lines.append(
-            row(
-                f"  {name}",
-                "learned from" if name in decision.features else "left out",
-                decision.reasons[name],
-            )
-        )
+    lines += ["", f"{'buffer':<21}{'for a fit':<16}why"]
+    for buffer, reason in decision.reasons.items():
+        use = "learned from" if buffer in decision.buffers else "left out"
+        lines.append(f"{buffer:<21}{use:<16}{reason}")
+    if scene.integrator.kind != PathTracer.kind:
+        lines += [
+            "",
+            f"{scene.integrator.kind}: Tungsten writes colour alone, Mitsuba has only the path_tracer",
+        ]
     return "\n".join(lines)
 
 
-def _reasons_without_information(scene: Scene, effects: Effects) -> dict[str, str]:
+def _reasons_without_information(scene: Scene, effects: Effects) -> dict[BufferName, str]:
     """Return the features that would be constant, or as noisy as the image, with the reason."""
-    reasons = {"visibility": "one random shadow ray a sample: as noisy as the image that it would guide"}
+    reasons: dict[BufferName, str] = {
+        "visibility": "one random shadow ray a sample: as noisy as the image that it would guide"
+    }
     surfaces = [p for p in _primitives(scene) if not isinstance(p, (*_ENVIRONMENT, Point, Instances))]
     if not surfaces:
-        reasons |= dict.fromkeys(("normal", "depth"), "nothing but environment is in the scene")
+        reasons["normal"] = reasons["depth"] = "nothing but environment is in the scene"
         if not effects.environment_light:
             reasons["albedo"] = "nothing is in the scene"
         return reasons
