@@ -21,21 +21,26 @@ namespace {
 
 using Array = py::array_t<float, py::array::c_style>;
 
-bool contiguous(const py::array& array) { return array.attr("flags").attr("c_contiguous").cast<bool>(); }
+bool has_flag(const py::array& array, const char* flag) {
+    return array.attr("flags").attr(flag).cast<bool>();
+}
+bool contiguous(const py::array& array) { return has_flag(array, "c_contiguous"); }
+bool aligned(const py::array& array) { return has_flag(array, "aligned"); }
 
 std::string described(const py::array& array) {
-    return py::str("{} of shape {}{}")
-        .format(array.dtype(), array.attr("shape"), contiguous(array) ? "" : ", not C-contiguous");
+    return py::str("{} of shape {}{}{}")
+        .format(array.dtype(), array.attr("shape"), contiguous(array) ? "" : ", not C-contiguous",
+                aligned(array) ? "" : ", not aligned");
 }
 
 // Only C++ knows that the data of inputs is not written to: numpy's read-only arrays are welcome.
 Image image_from_array(const std::string& name, const py::array& array) {
     const std::string expected =
-        name + ": expected a C-contiguous float32 array of shape (height, width, channels), got ";
+        name + ": expected an aligned C-contiguous float32 array of shape (height, width, channels), got ";
     if (!py::isinstance<py::array_t<float>>(array)) throw py::type_error(expected + described(array));
     constexpr py::ssize_t limit = std::numeric_limits<int>::max();
-    if (array.ndim() != 3 || !contiguous(array) || array.shape(0) > limit || array.shape(1) > limit ||
-        array.shape(2) > limit) {
+    if (array.ndim() != 3 || !contiguous(array) || !aligned(array) || array.shape(0) > limit ||
+        array.shape(1) > limit || array.shape(2) > limit) {
         throw py::value_error(expected + described(array));
     }
     return {.data = static_cast<float*>(const_cast<void*>(array.data())),

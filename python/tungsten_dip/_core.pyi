@@ -1,4 +1,4 @@
-"""The core in C++. Arrays are float32, C-contiguous, shape (height, width, channels), never modified.
+"""The core in C++. Arrays are float32, C-contiguous, aligned, (height, width, channels), never modified.
 
 Every function raises TypeError for another dtype and ValueError for another shape or layout; none converts.
 Inputs are read in place, also read-only ones. The interpreter lock is released during long work.

@@ -48,7 +48,7 @@ CALLS: list[Callable[[np.ndarray], object]] = [
 @pytest.mark.parametrize("dtype", [np.float64, np.float16, np.uint8, np.int32])
 def test_other_dtypes_are_refused(call: Callable[[np.ndarray], object], dtype: type) -> None:
     with pytest.raises(
-        TypeError, match=r"expected a C-contiguous float32 array .* got .*of shape \(4, 5, 3\)"
+        TypeError, match=r"expected an aligned C-contiguous float32 array .* got .*of shape \(4, 5, 3\)"
     ):
         call(np.zeros((4, 5, 3), dtype))
 
@@ -61,10 +61,11 @@ def test_other_dtypes_are_refused(call: Callable[[np.ndarray], object], dtype: t
         np.zeros((8, 5, 3), np.float32)[::2],
         np.zeros((4, 5), np.float32),
         np.zeros((1, 4, 5, 3), np.float32),
+        np.frombuffer(bytes(4 * 60 + 1), np.float32, offset=1).reshape(4, 5, 3),  # not where floats may lie
     ],
 )
 def test_other_layouts_are_refused(call: Callable[[np.ndarray], object], array: FloatImage) -> None:
-    with pytest.raises(ValueError, match="expected a C-contiguous float32 array of shape"):
+    with pytest.raises(ValueError, match="expected an aligned C-contiguous float32 array of shape"):
         call(array)
 
 

@@ -231,7 +231,7 @@ def test_what_does_not_fit_together_is_refused() -> None:
         _core.regress(target, features, penalty, guide, radius=1)
     with pytest.raises(ValueError, match="as many channels as the guide"):
         _core.regress(target, features, penalty, guide, target, radius=1)
-    with pytest.raises(TypeError, match="target: expected a C-contiguous float32"):
+    with pytest.raises(TypeError, match="target: expected an aligned C-contiguous float32"):
         _core.regress(target.astype(np.float64), features, penalty, radius=1)  # type: ignore[arg-type]
 
 
