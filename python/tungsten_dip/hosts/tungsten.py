@@ -40,7 +40,8 @@ Evidence = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class DriverOptions:
-    """The stock command's flags. None: as the scene file has it.
+    """The stock command's flags. None: as the scene file has it; its folder for `input_directory`, all cores
+    that this process may run on for `threads`, the stock command's own for `seed`.
 
     File names and folders are relative to the working directory, `output_file` and `hdr_output_file` to
     `output_directory` where that is given. `restart` ignores a saved state that could be resumed.

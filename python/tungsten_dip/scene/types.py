@@ -81,7 +81,10 @@ def default_pinhole_frame() -> Matrix:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Texture:
-    """A colour or a number over the surface; where a number is asked for, it is the mean of the RGB."""
+    """A colour or a number over the surface.
+
+    Where a number is asked for, it is the mean of a bitmap's RGB, and the first component of any other.
+    """
 
     kind: ClassVar[str] = ""
 
@@ -486,7 +489,7 @@ class RoughCoatBsdf(Bsdf):
 class ThinSheetBsdf(Bsdf):
     """A film that light crosses unbent.
 
-    ``thickness`` is in micrometres where ``enable_interference`` is set.
+    ``thickness`` is in units of 500 nm where ``enable_interference`` is set.
     """
 
     kind: ClassVar[str] = "thinsheet"
