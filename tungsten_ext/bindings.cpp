@@ -26,7 +26,7 @@ py::object array_over(const Evidence& evidence, float* data, int channels) {
 
 py::dict dict_from_evidence(const Evidence& evidence) {
     py::dict result;
-    for (const Quantity& quantity : evidence.quantities) {
+    for (const QuantityPlanes& quantity : evidence.quantities) {
         py::dict planes;
         planes["mean"] = array_over(evidence, quantity.mean, quantity.channels);
         planes["half_a"] = array_over(evidence, quantity.half_a, quantity.channels);

@@ -120,12 +120,12 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, std::vect
         const auto array = [&](const float* block) {
             return take ? const_cast<float*>(block) : memory.own({block, block + floats});
         };
-        const Quantity quantity{.name = name,
-                                .channels = static_cast<int>(channels),
-                                .mean = memory.own(std::move(*mean++)),
-                                .half_a = array(blocks.half_a),
-                                .half_b = array(blocks.half_b),
-                                .variance = array(blocks.squared_deviations)};
+        const QuantityPlanes quantity{.name = name,
+                                      .channels = static_cast<int>(channels),
+                                      .mean = memory.own(std::move(*mean++)),
+                                      .half_a = array(blocks.half_a),
+                                      .half_b = array(blocks.half_b),
+                                      .variance = array(blocks.squared_deviations)};
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
             combine(blocks, channels, begin, end, quantity.mean, quantity.variance);
         });

@@ -27,7 +27,7 @@ struct RenderOptions {
 // One quantity of the image, row 0 at the top, `channels` floats per pixel. `variance` is that of the mean.
 // The halves and the variance are null where the integrator mixes samples in a way that keeps no independent
 // halves.
-struct Quantity {
+struct QuantityPlanes {
     const char* name;
     int channels;
     float* mean;
@@ -41,7 +41,7 @@ struct Quantity {
 struct Evidence {
     int width;
     int height;
-    std::vector<Quantity> quantities;
+    std::vector<QuantityPlanes> quantities;
     float* spp;
     float uniform_spp;
     std::shared_ptr<void> memory;
