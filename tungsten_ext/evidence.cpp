@@ -7,6 +7,8 @@
 #include <vector>
 
 #include "camera_buffers.hpp"
+#include "thread/ThreadPool.hpp"
+#include "thread/ThreadUtils.hpp"
 
 namespace tungsten_dip {
 
@@ -40,11 +42,11 @@ void combine(const BufferBlocks& blocks, std::size_t channels, std::uint32_t beg
     }
 }
 
-// Calls f(begin, end) for a share of the items on every core. Tungsten's own parallelFor looks for the end of
-// the work only every 10 ms, which is a fifth of what a hand-over may take.
+// Calls f(begin, end) for a share of the items on as many threads as the render had. Tungsten's own
+// parallelFor looks for the end of the work only every 10 ms, which is a fifth of what a hand-over may take.
 template <typename F>
 void parallel_ranges(std::uint32_t items, const F& f) {
-    const std::uint32_t shares = std::max(1u, std::thread::hardware_concurrency());
+    const std::uint32_t shares = ThreadUtils::pool->threadCount();
     std::vector<std::jthread> threads;
     threads.reserve(shares);
     for (std::uint64_t share = 0; share < shares; ++share)
