@@ -17,6 +17,7 @@ import argparse
 import json
 import math
 import struct
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
@@ -384,6 +385,8 @@ def main() -> None:
     )
     parser.add_argument("--frames", type=int, default=1, help="of a camera that moves (default: 1)")
     options = parser.parse_args()
+    if options.frames < 1:
+        sys.exit(f"{sys.argv[0]}: --frames: expected a number above 0, got {options.frames}")
     for name, (make, spp, reference_spp) in SCENES.items():
         folder = options.folder / name
         folder.mkdir(parents=True, exist_ok=True)
