@@ -254,7 +254,9 @@ def test_a_worker_killed_within_a_frame_loses_nothing(frames, cluster):
 
 def test_local_workers_do_what_one_does(frames, capsys):
     pytest.importorskip("distributed")
+    (frames / "socket.py").write_text("open('foreign code', 'w'); raise ImportError")
     assert main(arguments("--workers", "2", "--json", "--frames", "0-3,9")) == 2
+    assert not (frames / "foreign code").exists()
     err = capsys.readouterr().err
     assert "1 of 5 frames have no result: 9" in err
     assert "frame 9: " in err

@@ -126,5 +126,5 @@ def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:
             f"{what}: expected shape {shape} (height, width, channels) as the colour has it, got "
             f"{array.shape}; render all buffers at one size"
         )
-    if not array.flags.c_contiguous:
-        raise InputError(f"{what}: expected rows one after the other in memory; use np.ascontiguousarray")
+    if not (array.flags.c_contiguous and array.flags.aligned):
+        raise InputError(f"{what}: expected aligned rows one after the other in memory; use .copy()")

@@ -28,6 +28,8 @@ _LONGEST_TASK = 24
 
 _CONNECT_TIMEOUT_S = 30
 
+_SAFE_PATH = "PYTHONSAFEPATH"
+
 _LOCAL_WORKERS = {
     # By default glibc hands all memory back at once, and a fit, which takes it again, needs twice the time.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
@@ -121,7 +123,7 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
         ) from error
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler == "local":
-        with dask.config.set(_LOCAL_WORKERS), ExitStack() as stack:
+        with dask.config.set(_LOCAL_WORKERS), _safe_path(), ExitStack() as stack:
             with _interrupts_blocked():
                 cluster = LocalCluster(
                     n_workers=workers,
@@ -156,6 +158,20 @@ def _interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let processes that start meanwhile import nothing from the current folder, which holds others' files."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 def _absolute(frame: Frame) -> Frame:
