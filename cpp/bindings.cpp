@@ -183,17 +183,26 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
     return out;
 }
 
-Array smooth_along_edges_array(const py::array& image, const py::array& features, float along, float across,
+Array structure_tensor_array(const py::array& features, int threads) {
+    const Image in = image_from_array("features", features);
+    Array out({in.height, in.width, 3});
+    const Image out_image = image_from_array("out", out);
+    const py::gil_scoped_release release;
+    structure_tensor(in, out_image, threads);
+    return out;
+}
+
+Array smooth_along_edges_array(const py::array& image, const py::array& tensor, float along, float across,
                                int threads) {
     const Image in = image_from_array("image", image);
-    const Image feature_image = image_from_array("features", features);
-    if (feature_image.height != in.height || feature_image.width != in.width) {
-        throw py::value_error("expected features in the size of the image");
+    const Image tensor_image = image_from_array("tensor", tensor);
+    if (tensor_image.height != in.height || tensor_image.width != in.width || tensor_image.channels != 3) {
+        throw py::value_error("expected a structure tensor in the size of the image, with 3 channels");
     }
     Array out = array_like(in);
     const Image out_image = image_from_array("out", out);
     const py::gil_scoped_release release;
-    smooth_along_edges(in, feature_image, along, across, out_image, threads);
+    smooth_along_edges(in, tensor_image, along, across, out_image, threads);
     return out;
 }
 
@@ -227,6 +236,7 @@ PYBIND11_MODULE(_core, module) {
                py::arg("guide") = py::none(), py::arg("guide_variance") = py::none(), py::kw_only(),
                py::arg("radius"), py::arg("step") = 1, py::arg("patch_radius") = 1, py::arg("k") = 1.0F,
                py::arg("ridge") = 1e-3F, py::arg("threads") = 0);
-    module.def("smooth_along_edges", &smooth_along_edges_array, py::arg("image"), py::arg("features"),
+    module.def("structure_tensor", &structure_tensor_array, py::arg("features"), py::arg("threads") = 0);
+    module.def("smooth_along_edges", &smooth_along_edges_array, py::arg("image"), py::arg("tensor"),
                py::kw_only(), py::arg("along"), py::arg("across"), py::arg("threads") = 0);
 }

@@ -84,43 +84,6 @@ void convolve_row(const std::vector<float>& in, const Kernel<radius>& kernel, st
     for (const float weight : kernel) add_scaled(from++, weight, out.size(), out.data());
 }
 
-// The products of the features' gradients, summed over features and smoothed: channels xx, yy, xy (Foerstner
-// and Guelch 1987). Padded by `edge` pixels.
-PaddedPlanes structure_tensor(ConstImage features, int edge, int threads) {
-    const PaddedPlanes planes(features, derivative_radius, threads);
-    const auto smooth = gaussian<derivative_radius>(derivative_sigma);
-    const auto derivative = gaussian_derivative<derivative_radius>(derivative_sigma);
-    PaddedPlanes products(3, features.height, features.width, tensor_radius);
-    parallel_for(features.height, threads, [&](int y) {
-        std::vector<float> columns;
-        std::vector<float> dx;
-        std::vector<float> dy;
-        for (int c = 0; c < features.channels; ++c) {
-            convolve_columns<derivative_radius>(planes, c, y, smooth, columns);
-            convolve_row<derivative_radius>(columns, derivative, dx);
-            convolve_columns<derivative_radius>(planes, c, y, derivative, columns);
-            convolve_row<derivative_radius>(columns, smooth, dy);
-            add_weighted(dx.data(), dx.data(), features.width, products.row(0, y));
-            add_weighted(dy.data(), dy.data(), features.width, products.row(1, y));
-            add_weighted(dx.data(), dy.data(), features.width, products.row(2, y));
-        }
-    });
-    products.repeat_border();
-    const auto window = gaussian<tensor_radius>(tensor_sigma);
-    PaddedPlanes tensor(3, features.height, features.width, edge);
-    parallel_for(features.height, threads, [&](int y) {
-        std::vector<float> columns;
-        std::vector<float> smoothed;
-        for (int c = 0; c < 3; ++c) {
-            convolve_columns<tensor_radius>(products, c, y, window, columns);
-            convolve_row<tensor_radius>(columns, window, smoothed);
-            std::ranges::copy(smoothed, tensor.row(c, y));
-        }
-    });
-    tensor.repeat_border();
-    return tensor;
-}
-
 struct TensorRow {
     const float* xx;
     const float* yy;
@@ -243,12 +206,45 @@ class LitBlocks {
 
 }  // namespace
 
-void smooth_along_edges(ConstImage image, ConstImage features, float along, float across, Image out,
+void structure_tensor(ConstImage features, Image out, int threads) {
+    if (out.size() == 0) return;
+    const PaddedPlanes planes(features, derivative_radius, threads);
+    const auto smooth = gaussian<derivative_radius>(derivative_sigma);
+    const auto derivative = gaussian_derivative<derivative_radius>(derivative_sigma);
+    PaddedPlanes products(3, features.height, features.width, tensor_radius);
+    parallel_for(features.height, threads, [&](int y) {
+        std::vector<float> columns;
+        std::vector<float> dx;
+        std::vector<float> dy;
+        for (int c = 0; c < features.channels; ++c) {
+            convolve_columns<derivative_radius>(planes, c, y, smooth, columns);
+            convolve_row<derivative_radius>(columns, derivative, dx);
+            convolve_columns<derivative_radius>(planes, c, y, derivative, columns);
+            convolve_row<derivative_radius>(columns, smooth, dy);
+            add_weighted(dx.data(), dx.data(), features.width, products.row(0, y));
+            add_weighted(dy.data(), dy.data(), features.width, products.row(1, y));
+            add_weighted(dx.data(), dy.data(), features.width, products.row(2, y));
+        }
+    });
+    products.repeat_border();
+    const auto window = gaussian<tensor_radius>(tensor_sigma);
+    parallel_for(features.height, threads, [&](int y) {
+        std::vector<float> columns;
+        std::vector<float> smoothed;
+        for (int c = 0; c < 3; ++c) {
+            convolve_columns<tensor_radius>(products, c, y, window, columns);
+            convolve_row<tensor_radius>(columns, window, smoothed);
+            for (int x = 0; x < out.width; ++x) out.at(y, x, c) = smoothed[static_cast<std::size_t>(x)];
+        }
+    });
+}
+
+void smooth_along_edges(ConstImage image, ConstImage tensor_image, float along, float across, Image out,
                         int threads) {
     if (!(along > 0) || !(across > 0)) throw std::invalid_argument("along and across must be above 0");
     if (image.size() == 0) return;
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
-    const PaddedPlanes tensor = structure_tensor(features, radius, threads);
+    const PaddedPlanes tensor(tensor_image, radius, threads);
     const PaddedPlanes planes(image, radius, threads);
     const LitBlocks lit(planes, radius, threads);
     const auto smooth_block = [&](int y, int first, int count) {

@@ -92,10 +92,13 @@ def regress(
     At most 16 features; everything must be finite. See ``regress`` in core.hpp.
     """
 
+def structure_tensor(features: FloatImage, threads: int = 0) -> FloatImage:
+    """Return the products xx, yy, xy of the gradients of ``features``, summed and smoothed."""
+
 def smooth_along_edges(
-    image: FloatImage, features: FloatImage, *, along: float, across: float, threads: int = 0
+    image: FloatImage, tensor: FloatImage, *, along: float, across: float, threads: int = 0
 ) -> FloatImage:
-    """Return ``image``, averaged by a Gaussian that follows the edges of ``features``.
+    """Return ``image``, averaged by a Gaussian that follows the edges of a `structure_tensor`.
 
     ``along`` and ``across`` are its standard deviations in pixels. See ``smooth_along_edges`` in core.hpp.
     """

@@ -23,7 +23,9 @@ constexpr std::array sizes{Size{.height = 1, .width = 1},  Size{.height = 1, .wi
 
 Pixels smoothed(Pixels& image, Pixels& features, int threads = 2) {
     Pixels out(image.height, image.width, image.channels, -1.0F);
-    smooth_along_edges(image.view(), features.view(), 6, 0.3F, out.view(), threads);
+    Pixels tensor(image.height, image.width, 3);
+    structure_tensor(features.view(), tensor.view(), threads);
+    smooth_along_edges(image.view(), tensor.view(), 6, 0.3F, out.view(), threads);
     return out;
 }
 
@@ -80,11 +82,11 @@ void nothing_is_no_error() {
     Pixels features(0, 5, 2);
     smoothed(none, features);
     Pixels one(1, 1, 3);
-    Pixels feature(1, 1, 1);
+    Pixels tensor(1, 1, 3);
     Pixels out(1, 1, 3);
     bool refused = false;
     try {
-        smooth_along_edges(one.view(), feature.view(), 0, 0.3F, out.view(), 1);
+        smooth_along_edges(one.view(), tensor.view(), 0, 0.3F, out.view(), 1);
     } catch (const std::invalid_argument&) {
         refused = true;
     }

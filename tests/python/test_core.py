@@ -242,6 +242,24 @@ def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
 
 
+def _smoothed(
+    image: FloatImage, features: FloatImage, along: float, across: float, threads: int = 0
+) -> FloatImage:
+    tensor = _core.structure_tensor(features, threads)
+    return _core.smooth_along_edges(image, tensor, along=along, across=across, threads=threads)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.5])
+def test_the_structure_tensor_of_a_slope_is_the_product_of_its_gradients(angle: float) -> None:
+    rows, columns = np.indices((41, 43), np.float32)
+    slope = (2 * np.cos(angle) * columns + 2 * np.sin(angle) * rows)[:, :, None].astype(np.float32)
+    tensor = _core.structure_tensor(np.concatenate((slope, slope), axis=2))
+    expected = 8 * np.array([np.cos(angle) ** 2, np.sin(angle) ** 2, np.cos(angle) * np.sin(angle)])
+    inner = tensor[10:-10, 10:-10]
+    # The derivative's kernel is cut off at 3 pixels.
+    np.testing.assert_allclose(inner, np.broadcast_to(expected, inner.shape), atol=0.05)
+
+
 def _half_plane(angle: float, size: int = 41) -> FloatImage:
     """Coverage of the pixels by the half-plane whose edge runs through the middle at an angle."""
     rows, columns = np.indices((size, size)) - size // 2
@@ -253,10 +271,10 @@ def _half_plane(angle: float, size: int = 41) -> FloatImage:
 def test_smoothing_along_edges_keeps_them_and_takes_their_noise(angle: float) -> None:
     edge = _half_plane(angle)
     noise = np.random.default_rng(4).normal(0, 0.1, edge.shape).astype(np.float32)
-    smooth = _core.smooth_along_edges(edge, edge, along=3, across=0.3)
+    smooth = _smoothed(edge, edge, along=3, across=0.3)
     inner = np.s_[8:-8, 8:-8]
     assert np.sqrt(np.mean((smooth - edge)[inner] ** 2)) < 0.03
-    residual = _core.smooth_along_edges(edge + noise, edge, along=3, across=0.3) - smooth
+    residual = _smoothed(edge + noise, edge, along=3, across=0.3) - smooth
     at_edge = (edge[inner] > 0.01) & (edge[inner] < 0.99)
     assert residual[inner][at_edge].std() < 0.06
 
@@ -264,15 +282,15 @@ def test_smoothing_along_edges_keeps_them_and_takes_their_noise(angle: float) ->
 def test_smoothing_along_edges_leaves_corners_and_constants() -> None:
     corner = np.zeros((31, 31, 3), np.float32)
     corner[15:, 15:] = 5
-    smooth = _core.smooth_along_edges(corner, corner, along=3, across=0.3)
+    smooth = _smoothed(corner, corner, along=3, across=0.3)
     assert smooth[15, 15, 0] > 4
     assert smooth[14, 14, 0] < 0.5
     # The line of an edge goes on beyond its end.
-    smooth = _core.smooth_along_edges(corner, corner, along=8, across=0.3)
+    smooth = _smoothed(corner, corner, along=8, across=0.3)
     assert smooth[18:, 18:].min() > 4.7
     constant = np.full((9, 13, 3), 2.5, np.float32)
     for features in (constant, corner[:9, :13].copy(), np.empty((9, 13, 0), np.float32)):
-        smooth = _core.smooth_along_edges(constant, features, along=3, across=0.3)
+        smooth = _smoothed(constant, features, along=3, across=0.3)
         np.testing.assert_allclose(smooth, 2.5, rtol=1e-5)
 
 
@@ -281,9 +299,7 @@ def test_smoothing_along_edges_of_a_light_alone() -> None:
     light = np.zeros((70, 110, 3), np.float32)
     light[60:64, 2:5], light[20, 90] = 9, 5
     # Where nothing is lit for far around, nothing is computed; on a pedestal all is.
-    alone, lifted = (
-        _core.smooth_along_edges(image, features, along=3, across=0.3) for image in (light, light + 1)
-    )
+    alone, lifted = (_smoothed(image, features, along=3, across=0.3) for image in (light, light + 1))
     np.testing.assert_allclose(alone, lifted - 1, atol=1e-5)
     assert alone[:, 40:70].max() == 0 < alone[60:64, 2:5].min()
 
@@ -291,22 +307,23 @@ def test_smoothing_along_edges_of_a_light_alone() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (0, 4)])
 def test_smoothing_along_edges_of_small_images(size: tuple[int, int]) -> None:
     image = np.random.default_rng(2).random((*size, 3), np.float32)
-    smooth = _core.smooth_along_edges(image, image, along=3, across=0.3)
+    smooth = _smoothed(image, image, along=3, across=0.3)
     assert smooth.shape == image.shape
     assert np.isfinite(smooth).all()
     if image.size:
         assert image.min() <= smooth.min() * 1.001
         assert smooth.max() <= image.max() * 1.001
-    one, many = (_core.smooth_along_edges(image, image, along=3, across=0.3, threads=n) for n in (1, 4))
+    one, many = (_smoothed(image, image, along=3, across=0.3, threads=n) for n in (1, 4))
     assert one.tobytes() == many.tobytes()
 
 
 def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
     image = np.ones((4, 5, 3), np.float32)
-    with pytest.raises(ValueError, match="size of the image"):
-        _core.smooth_along_edges(image, image[:3].copy(), along=3, across=0.3)
+    for tensor in (image[:3].copy(), image[:, :, :1].copy()):
+        with pytest.raises(ValueError, match="in the size of the image, with 3 channels"):
+            _core.smooth_along_edges(image, tensor, along=3, across=0.3)
     with pytest.raises(ValueError, match="above 0"):
-        _core.smooth_along_edges(image, image, along=0, across=0.3)
+        _smoothed(image, image, along=0, across=0.3)
 
 
 @pytest.mark.parametrize("window", [{"radius": -1}, {"radius": 5, "step": 2}, {"step": 0}, {"k": 0.0}])

@@ -121,7 +121,7 @@ class Guidance:
     every pixel, called ``names``; ``penalty`` one value for each. ``left_out`` holds the value of each of the
     others. ``albedo``, shape (height, width, 3), divides the colour and is never 0. ``emission`` is the
     radiance that the half's own samples saw lights emit, which is taken from the colour before,
-    ``smooth_emission`` what is given back.
+    ``smooth_emission`` what is given back. ``edges`` is the features' structure tensor.
     """
 
     features: FloatImage
@@ -131,6 +131,7 @@ class Guidance:
     albedo: FloatImage
     emission: FloatImage
     smooth_emission: FloatImage
+    edges: FloatImage
     threads: int
 
     def irradiance(self, color: FloatImage) -> FloatImage:
@@ -199,6 +200,7 @@ def guidance_of_halves(
         for index, name in enumerate(kept):
             features[:, :, index] = planes[name][0]
         penalty = tuple(planes[name][1] for name in kept)
+        edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
         albedo = np.ones(shown[half].shape, np.float32)
         emission = smooth_emission = np.zeros(shown[half].shape, np.float32)
         if filtered.albedo is not None:
@@ -207,24 +209,19 @@ def guidance_of_halves(
             emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
             smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
             if emission.any():
-                smooth_emission = _smooth_emission(emission, smooth_emission, features, penalty, threads)
+                smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
         left_out = {name: float(planes[name][0][0, 0]) for name in flat}
         guidance.append(
-            Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, threads)
+            Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
         )
     return tuple(guidance)
 
 
 def _smooth_emission(
-    emission: FloatImage,
-    filtered: FloatImage,
-    features: FloatImage,
-    penalty: tuple[float, ...],
-    threads: int,
+    emission: FloatImage, filtered: FloatImage, edges: FloatImage, threads: int
 ) -> FloatImage:
     """The pre-filter blurs long edges of bright lights, the mean along edges their corners."""
-    along = _along_edges(emission, EDGES.radius, features, penalty, threads)
-    smooth: FloatImage = np.float32(0.5) * (filtered + along)
+    smooth: FloatImage = np.float32(0.5) * (filtered + _along_edges(emission, edges, EDGES.radius, threads))
     return smooth
 
 
@@ -347,7 +344,7 @@ class PilotMaker:
         """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
         if pilot.along_edges:
             return tuple(
-                _along_edges(color, pilot.radius, g.features, g.penalty, g.threads)
+                _along_edges(color, g.edges, pilot.radius, g.threads)
                 for color, g in zip(self.colors, self.guidance, strict=True)
             )
         guidance, guides = self._by_color if pilot.by_color else (self.guidance, self.guides)
@@ -378,12 +375,9 @@ def _without_features(guidance: Guidance) -> Guidance:
     )
 
 
-def _along_edges(
-    image: FloatImage, radius: float, features: FloatImage, penalty: tuple[float, ...], threads: int
-) -> FloatImage:
-    steepness = features * np.sqrt(np.array(penalty, np.float32))
+def _along_edges(image: FloatImage, edges: FloatImage, radius: float, threads: int) -> FloatImage:
     return _core.smooth_along_edges(
-        np.ascontiguousarray(image), steepness, along=radius, across=_ACROSS_EDGES, threads=threads
+        np.ascontiguousarray(image), edges, along=radius, across=_ACROSS_EDGES, threads=threads
     )
 
 

@@ -162,7 +162,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Let processes that start meanwhile import nothing from the current folder, which holds others' files."""
+    """Let processes that start meanwhile import nothing from the current folder."""
     before = os.environ.get(_SAFE_PATH)
     os.environ[_SAFE_PATH] = "1"
     try:
