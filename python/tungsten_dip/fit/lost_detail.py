@@ -33,26 +33,30 @@ def with_what_was_lost(halves: Halves, fused: Halves) -> Halves:
     """Give back to each half's image what its noisy half rightly shows otherwise.
 
     ``halves`` are the noisy halves and ``fused`` what was made of each alone, both in the units of
-    `evidence.Evidence`, shape (height, width, 3). Over all pixels that differ by some factor and more, the
-    difference of the *other* half from the result is regressed on this half's. Its noise is independent, so
-    the slope is the part of the difference that is true; as much of it as is sure is given back. On most
-    images that is nothing.
+    `evidence.Evidence`, shape (height, width, 3). With f a half's result, a its noisy half, b the other one
+    and d = f^2 + 0.01, over all pixels in which a and f differ by some factor and more
+
+        slope = sum p / sum q,  standard error = sqrt(sum (p - slope q)^2) / sum q  (White 1980),
+        p = (a - f) (b - f) / d,  q = (a - f)^2 / d.
+
+    The noise of b is independent, so the slope is the part of the difference a - f that is true; as much of
+    it as is sure is given back. On most images that is nothing.
     """
     octaves = [np.log2(_level(noisy) / _level(image)) for noisy, image in zip(halves, fused, strict=True)]
     given = [image.copy() for image in fused]
     for side in (-1, 1):
         places = [np.nonzero(side * o >= _OCTAVES[1]) for o in octaves]
-        apart = [side * o[place] for o, place in zip(octaves, places, strict=True)]
-        own, told = [], []
+        octaves_apart = [side * o[place] for o, place in zip(octaves, places, strict=True)]
+        products, squares = [], []
         for half, place in enumerate(places):
             image = fused[half][place].astype(np.float64)
             shown, shown_by_other = halves[half][place] - image, halves[1 - half][place] - image
             denominator = image.mean(axis=1) ** 2 + RELMSE_EPSILON
-            own.append((shown**2).mean(axis=1) / denominator)
-            told.append((shown * shown_by_other).mean(axis=1) / denominator)
-        slopes = _sure_slopes(np.concatenate(apart), np.concatenate(own), np.concatenate(told))
+            products.append((shown * shown_by_other).mean(axis=1) / denominator)
+            squares.append((shown**2).mean(axis=1) / denominator)
+        slopes = _sure_slopes(*(np.concatenate(values) for values in (octaves_apart, products, squares)))
         for half, place in enumerate(places):
-            share = np.interp(apart[half], _OCTAVES, slopes).astype(np.float32)[:, None]
+            share = np.interp(octaves_apart[half], _OCTAVES, slopes).astype(np.float32)[:, None]
             given[half][place] += share * (halves[half][place] - fused[half][place])
     return given[0], given[1]
 
@@ -62,19 +66,19 @@ def _level(image: FloatImage) -> FloatImage:
     return level
 
 
-def _sure_slopes(apart: FloatImage, own: _Floats, told: _Floats) -> _Floats:
+def _sure_slopes(octaves_apart: FloatImage, p: _Floats, q: _Floats) -> _Floats:
     """Return, for each of `_OCTAVES`, which part of the difference of pixels so far apart is surely true."""
-    rung = np.searchsorted(_OCTAVES, apart, side="right") - 1
+    rung = np.searchsorted(_OCTAVES, octaves_apart, side="right") - 1
 
-    def as_far(values: _Floats) -> _Floats:
+    def sum_beyond(values: _Floats) -> _Floats:
         sums: _Floats = np.bincount(rung, values, minlength=len(_OCTAVES)).astype(np.float64)
         return sums[::-1].cumsum()[::-1]
 
-    total = np.maximum(as_far(own), 1e-30)
-    slopes = as_far(told) / total
-    residuals = as_far(told**2) - 2 * slopes * as_far(told * own) + slopes**2 * as_far(own**2)
+    total = np.maximum(sum_beyond(q), 1e-30)
+    slopes = sum_beyond(p) / total
+    residuals = sum_beyond(p**2) - 2 * slopes * sum_beyond(p * q) + slopes**2 * sum_beyond(q**2)
     sure = np.clip(slopes - _SURELY * np.sqrt(np.maximum(residuals, 0)) / total, 0, 1)
-    sure[as_far(np.ones_like(own)) < _FEW] = 0
+    sure[sum_beyond(np.ones_like(q)) < _FEW] = 0
     sure[0] = 0
     # What is true of some pixels is true of those yet farther apart.
     accumulated: _Floats = np.maximum.accumulate(sure)
