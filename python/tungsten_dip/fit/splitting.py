@@ -71,7 +71,10 @@ def with_independent_halves(
     if buffers.albedo is not None:
         emitted = np.maximum(buffers.albedo.mean - 1, 0)
     share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
-    notes = [f"{_why(buffers, test)}: its noise, as the pixels around tell it, is split at random into two"]
+    notes = [
+        f"{_why(buffers, test)}: its noise, as the pixels around tell it, is split at random into two; the "
+        f"estimated error may be too low"
+    ]
     if candidates:
         notes.append("the candidates are not used: what made them knew both halves of the noise")
     split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
