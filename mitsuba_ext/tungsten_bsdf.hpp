@@ -4,7 +4,6 @@
 // context; wi and wo are in the shading frame, and values include the cosine of wo.
 #pragma once
 
-#include <mitsuba/core/properties.h>
 #include <mitsuba/core/warp.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/texture.h>
@@ -12,20 +11,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <numbers>
 #include <sstream>
 #include <string>
 #include <utility>
 
+#include "tungsten_plugin.hpp"
+
 namespace mitsuba {
-
-constexpr float kInvPi = std::numbers::inv_pi_v<float>;
-constexpr float kTwoPi = 6.283185307f;
-
-template <typename Scalar>
-Scalar squared(Scalar x) {
-    return x * x;
-}
 
 struct FresnelTerm {
     float reflectance;
@@ -44,13 +36,13 @@ inline FresnelTerm dielectric_fresnel(float eta, float cos_i) {
 
 // The cosine-weighted mean over the hemisphere of the reflectance inside a medium of index `ior`.
 inline float diffuse_fresnel_inside(float ior) {
-    constexpr int kSteps = 20000;
+    constexpr int steps = 20000;
     double sum = 0;
-    for (int i = 0; i < kSteps; ++i) {
-        const double cos_squared = (i + 0.5) / kSteps;
+    for (int i = 0; i < steps; ++i) {
+        const double cos_squared = (i + 0.5) / steps;
         sum += dielectric_fresnel(ior, static_cast<float>(std::sqrt(cos_squared))).reflectance;
     }
-    return static_cast<float>(sum / kSteps);
+    return static_cast<float>(sum / steps);
 }
 
 // Reflection by the microfacets of a dielectric surface (Walter et al., "Microfacet Models for Refraction
@@ -86,11 +78,11 @@ struct RoughReflection {
         const float tan_squared = std::max(1.f - cos_squared, 0.f) / cos_squared;
         switch (distribution) {
             case Distribution::Beckmann:
-                return kInvPi * std::exp(-tan_squared / squared(alpha)) / squared(alpha * cos_squared);
+                return inv_pi * std::exp(-tan_squared / squared(alpha)) / squared(alpha * cos_squared);
             case Distribution::Phong:
-                return (alpha + 2.f) / kTwoPi * static_cast<float>(std::pow(double{cos_m}, double{alpha}));
+                return (alpha + 2.f) / two_pi * static_cast<float>(std::pow(double{cos_m}, double{alpha}));
             default:
-                return kInvPi * squared(alpha / (cos_squared * (squared(alpha) + tan_squared)));
+                return inv_pi * squared(alpha / (cos_squared * (squared(alpha) + tan_squared)));
         }
     }
 
@@ -135,7 +127,7 @@ struct RoughReflection {
                 cos_m = 1.f / std::sqrt(1.f + squared(a) * u.x() / (1.f - u.x()));
         }
         const float sin_m = std::sqrt(std::max(1.f - cos_m * cos_m, 0.f));
-        const Vector3f m(std::cos(kTwoPi * u.y()) * sin_m, std::sin(kTwoPi * u.y()) * sin_m, cos_m);
+        const Vector3f m(std::cos(two_pi * u.y()) * sin_m, std::sin(two_pi * u.y()) * sin_m, cos_m);
         return 2.f * dr::dot(wi, m) * m - wi;
     }
 };
@@ -194,13 +186,3 @@ class TungstenBsdf : public BSDF<Float, Spectrum> {
 };
 
 }  // namespace mitsuba
-
-// Registers a plugin for the one variant that the embedded host renders with.
-#define TUNGSTEN_EXPORT_PLUGIN(Name)                                                              \
-    extern "C" MI_EXPORT void init_plugin(std::string_view name, mitsuba::PluginRegisterFn add) { \
-        using Plugin = mitsuba::Name<float, mitsuba::Color<float, 3>>;                            \
-        add(name, "scalar_rgb", Plugin::Type,                                                     \
-            [](void*, const mitsuba::Properties& props) -> mitsuba::ref<mitsuba::Object> {        \
-                return new Plugin(props);                                                         \
-            });                                                                                   \
-    }

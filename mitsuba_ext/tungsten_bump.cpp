@@ -20,23 +20,23 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
 
     explicit Bump(const Properties& props) : Base(props) {
         for (const auto& prop : props.objects())
-            if (auto* bsdf = prop.try_get<BSDF>()) m_nested = bsdf;
-        if (!m_nested) Throw("Expected a nested BSDF on the bent surface");
-        m_slopes = props.get_texture<Texture>("slopes", 0.f);
+            if (auto* bsdf = prop.try_get<BSDF>()) nested_ = bsdf;
+        if (!nested_) Throw("Expected a nested BSDF on the bent surface");
+        slopes_ = props.get_texture<Texture>("slopes", 0.f);
         const auto shape = props.get<std::string>("shape");
         if (shape != "mesh" && shape != "cube" && shape != "quad")
             Throw("Expected the shape mesh, cube or quad, got \"%s\"", shape);
-        m_consistent = props.get<bool>("consistent", false);
-        m_unit = shape != "quad";
-        m_mirrors = shape == "mesh";
-        for (size_t i = 0; i < m_nested->component_count(); ++i) Base::add_component(m_nested->flags(i));
+        consistent_ = props.get<bool>("consistent", false);
+        unit_ = shape != "quad";
+        mirrors_ = shape == "mesh";
+        for (size_t i = 0; i < nested_->component_count(); ++i) Base::add_component(nested_->flags(i));
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si,
                                              Float sample1, const Point2f& sample2,
                                              Mask active) const override {
         const SurfaceInteraction3f bent = bent_interaction(si);
-        auto [bs, weight] = m_nested->sample(context, bent, sample1, sample2, active);
+        auto [bs, weight] = nested_->sample(context, bent, sample1, sample2, active);
         const Vector3f direction = bent.to_world(bs.wo);
         const bool is_kept = is_consistent(si, direction, bs.wo);
         bs.wo = si.to_local(direction);
@@ -45,7 +45,7 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
     }
 
     Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_nested->eval_null_transmission(si, active);
+        return nested_->eval_null_transmission(si, active);
     }
 
     MI_DECLARE_CLASS(Bump)
@@ -56,28 +56,28 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
         const Vector3f direction = si.to_world(wo);
         const Vector3f bent_wo = bent.to_local(direction);
         if (!is_consistent(si, direction, bent_wo)) return {Spectrum(0.f), 0.f};
-        return m_nested->eval_pdf(BSDFContext(), bent, bent_wo, true);
+        return nested_->eval_pdf(BSDFContext(), bent, bent_wo, true);
     }
 
   private:
     bool is_consistent(const SurfaceInteraction3f& si, const Vector3f& direction,
                        const Vector3f& bent_wo) const {
-        return !m_consistent || (dr::dot(Vector3f(si.n), direction) < 0.f) == (bent_wo.z() < 0.f);
+        return !consistent_ || (dr::dot(Vector3f(si.n), direction) < 0.f) == (bent_wo.z() < 0.f);
     }
 
     SurfaceInteraction3f bent_interaction(const SurfaceInteraction3f& si) const {
         const Vector3f n(si.sh_frame.n);
         Vector3f tangent = si.dp_du;
         Vector3f bitangent = si.dp_dv;
-        if (m_unit) {
+        if (unit_) {
             tangent = dr::normalize(tangent);
             bitangent = dr::normalize(bitangent);
         }
-        if (m_mirrors && dr::dot(dr::cross(tangent, bitangent), Vector3f(si.n)) < 0.f) {
+        if (mirrors_ && dr::dot(dr::cross(tangent, bitangent), Vector3f(si.n)) < 0.f) {
             tangent = -tangent;
             bitangent = -bitangent;
         }
-        const Color3f slope = m_slopes->eval_3(si, true);
+        const Color3f slope = slopes_->eval_3(si, true);
         tangent += n * (slope.x() - dr::dot(n, tangent));
         bitangent += n * (slope.y() - dr::dot(n, bitangent));
         Vector3f bent_n = dr::cross(tangent, bitangent);
@@ -93,13 +93,13 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
         return bent;
     }
 
-    ref<BSDF> m_nested;
-    ref<Texture> m_slopes;
-    bool m_unit;  // tangents have length 1, not that of the quad's edges
-    bool m_consistent;
-    bool m_mirrors;  // tangents point the other way where the texture is mirrored
+    ref<BSDF> nested_;
+    ref<Texture> slopes_;
+    bool unit_;  // tangents have length 1, not that of the quad's edges
+    bool consistent_;
+    bool mirrors_;  // tangents point the other way where the texture is mirrored
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(Bump)
+TUNGSTEN_EXPORT_PLUGIN(Bump<float, Rgb>)

@@ -6,7 +6,6 @@
 //
 // Small angles keep their digits: 1 - cos is computed as 2 sin^2 of half the angle throughout.
 #include <mitsuba/core/frame.h>
-#include <mitsuba/core/properties.h>
 #include <mitsuba/render/emitter.h>
 #include <mitsuba/render/scene.h>
 #include <mitsuba/render/texture.h>
@@ -16,7 +15,7 @@
 #include <string>
 #include <utility>
 
-#include "tungsten_bsdf.hpp"
+#include "tungsten_plugin.hpp"
 
 namespace mitsuba {
 
@@ -28,28 +27,28 @@ class Cap final : public Emitter<Float, Spectrum> {
 
     explicit Cap(const Properties& props)
         : Base(props),
-          m_frame(dr::normalize(props.get<ScalarVector3f>("direction"))),
-          m_height(2.f * squared(std::sin(0.5f * props.get<ScalarFloat>("cap_angle")))),
-          m_radiance(props.get_unbounded_texture<Texture>("radiance")) {
+          frame_(dr::normalize(props.get<ScalarVector3f>("direction"))),
+          height_(2.f * squared(std::sin(0.5f * props.get<ScalarFloat>("cap_angle")))),
+          radiance_(props.get_unbounded_texture<Texture>("radiance")) {
         m_flags = +EmitterFlags::Infinite;
     }
 
     void set_scene(const Scene* scene) override {
-        if (scene->bbox().valid()) m_sphere = scene->bbox().bounding_sphere();
+        if (scene->bbox().valid()) sphere_ = scene->bbox().bounding_sphere();
     }
 
     Spectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
-        return covers(-si.wi) ? m_radiance->eval(si, active) : Spectrum(0.f);
+        return covers(-si.wi) ? radiance_->eval(si, active) : Spectrum(0.f);
     }
 
     std::pair<DirectionSample3f, Spectrum> sample_direction(const Interaction3f& it, const Point2f& sample,
                                                             Mask active) const override {
-        const Float drop = sample.x() * m_height;
+        const Float drop = sample.x() * height_;
         const Float sine = std::sqrt(std::max(drop * (2.f - drop), 0.f));
-        const Float phi = kTwoPi * sample.y();
+        const Float phi = two_pi * sample.y();
         auto direction = dr::zeros<DirectionSample3f>();
-        direction.d = m_frame.to_world(Vector3f(sine * std::cos(phi), sine * std::sin(phi), 1.f - drop));
-        direction.dist = 2.f * std::max(m_sphere.radius, dr::norm(it.p - m_sphere.center));
+        direction.d = frame_.to_world(Vector3f(sine * std::cos(phi), sine * std::sin(phi), 1.f - drop));
+        direction.dist = 2.f * std::max(sphere_.radius, dr::norm(it.p - sphere_.center));
         direction.p = it.p + direction.d * direction.dist;
         direction.n = -direction.d;
         direction.time = it.time;
@@ -77,21 +76,21 @@ class Cap final : public Emitter<Float, Spectrum> {
   private:
     // |d - axis|^2 = 2 (1 - cos), of unit vectors.
     [[nodiscard]] bool covers(const Vector3f& d) const {
-        return dr::squared_norm(d - Vector3f(m_frame.n)) <= 2.f * m_height;
+        return dr::squared_norm(d - Vector3f(frame_.n)) <= 2.f * height_;
     }
 
-    [[nodiscard]] Float density() const { return 1.f / (kTwoPi * m_height); }
+    [[nodiscard]] Float density() const { return 1.f / (two_pi * height_); }
 
     [[nodiscard]] Spectrum radiance(Mask active) const {
-        return m_radiance->eval(dr::zeros<SurfaceInteraction3f>(), active);
+        return radiance_->eval(dr::zeros<SurfaceInteraction3f>(), active);
     }
 
-    Frame<ScalarFloat> m_frame;
-    ScalarFloat m_height;  // of the cap, on a sphere of radius 1
-    ref<Texture> m_radiance;
-    ScalarBoundingSphere3f m_sphere{ScalarPoint3f(0.f), 1.f};
+    Frame<ScalarFloat> frame_;
+    ScalarFloat height_;  // of the cap, on a sphere of radius 1
+    ref<Texture> radiance_;
+    ScalarBoundingSphere3f sphere_{ScalarPoint3f(0.f), 1.f};
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(Cap)
+TUNGSTEN_EXPORT_PLUGIN(Cap<float, Rgb>)

@@ -12,7 +12,7 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture)
 
     explicit DiffuseTransmission(const Properties& props) : Base(props) {
-        m_albedo = props.get_texture<Texture>("albedo", 1.f);
+        albedo_ = props.get_texture<Texture>("albedo", 1.f);
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide | BSDFFlags::BackSide);
         Base::add_component(BSDFFlags::DiffuseTransmission | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
@@ -28,22 +28,22 @@ class DiffuseTransmission final : public TungstenBsdf<Float, Spectrum> {
                                    : Base::sample_of(wo, BSDFFlags::DiffuseReflection, 0);
         // Tungsten forgets here that only a share of the directions goes to this side; as it weighs its light
         // samples by the right density, its picture is somewhat too bright.
-        bs.pdf = kInvPi * std::abs(wo.z());
-        return {bs, m_albedo->eval(si)};
+        bs.pdf = inv_pi * std::abs(wo.z());
+        return {bs, albedo_->eval(si)};
     }
 
     MI_DECLARE_CLASS(DiffuseTransmission)
 
   protected:
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
-        const Float density = 0.5f * kInvPi * std::abs(wo.z());
-        return {m_albedo->eval(si) * density, density};
+        const Float density = 0.5f * inv_pi * std::abs(wo.z());
+        return {albedo_->eval(si) * density, density};
     }
 
   private:
-    ref<Texture> m_albedo;
+    ref<Texture> albedo_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(DiffuseTransmission)
+TUNGSTEN_EXPORT_PLUGIN(DiffuseTransmission<float, Rgb>)

@@ -3,12 +3,11 @@
 // Mitsuba samples the texels of a light's texture instead, which needs UV that cover the shape once.
 //
 //   (nested)   the texture of the radiance
-#include <mitsuba/core/properties.h>
 #include <mitsuba/render/texture.h>
 
 #include <string>
 
-#include "tungsten_bsdf.hpp"
+#include "tungsten_plugin.hpp"
 
 namespace mitsuba {
 
@@ -20,17 +19,17 @@ class Emission final : public Texture<Float, Spectrum> {
 
     explicit Emission(const Properties& props) : Base(props) {
         for (const auto& prop : props.objects())
-            if (auto* texture = prop.try_get<Base>()) m_texture = texture;
-        if (!m_texture) Throw("Expected a nested texture");
+            if (auto* texture = prop.try_get<Base>()) texture_ = texture;
+        if (!texture_) Throw("Expected a nested texture");
     }
 
     UnpolarizedSpectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
-        return m_texture->eval(si, active);
+        return texture_->eval(si, active);
     }
 
-    Float mean() const override { return m_texture->mean(); }
+    Float mean() const override { return texture_->mean(); }
 
-    ScalarFloat max() const override { return m_texture->max(); }
+    ScalarFloat max() const override { return texture_->max(); }
 
     [[nodiscard]] bool is_spatially_varying() const override { return false; }
 
@@ -39,9 +38,9 @@ class Emission final : public Texture<Float, Spectrum> {
     MI_DECLARE_CLASS(Emission)
 
   private:
-    ref<Base> m_texture;
+    ref<Base> texture_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(Emission)
+TUNGSTEN_EXPORT_PLUGIN(Emission<float, Rgb>)

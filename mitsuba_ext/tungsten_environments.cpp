@@ -4,7 +4,6 @@
 //   cap_0, cap_1, ...       bool: the light leaves the others visible where it is black
 //
 // As in Tungsten, surfaces are lit by all of them, and a ray that leaves the scene sees the last alone.
-#include <mitsuba/core/properties.h>
 #include <mitsuba/render/emitter.h>
 
 #include <algorithm>
@@ -12,7 +11,7 @@
 #include <utility>
 #include <vector>
 
-#include "tungsten_bsdf.hpp"
+#include "tungsten_plugin.hpp"
 
 namespace mitsuba {
 
@@ -28,19 +27,19 @@ class Environments final : public Emitter<Float, Spectrum> {
             auto* emitter = dynamic_cast<Base*>(nested.get());
             if (emitter == nullptr || !emitter->is_environment())
                 Throw("Expected emitters that surround the scene");
-            m_lights.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false)});
+            lights_.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false)});
         }
-        if (m_lights.empty()) Throw("Expected nested emitters");
+        if (lights_.empty()) Throw("Expected nested emitters");
         m_flags = +EmitterFlags::Infinite;
     }
 
     void set_scene(const Scene* scene) override {
-        for (Light& light : m_lights) light.emitter->set_scene(scene);
+        for (Light& light : lights_) light.emitter->set_scene(scene);
     }
 
     // What a ray sees.
     Spectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
-        for (auto light = m_lights.rbegin(); light != m_lights.rend(); ++light) {
+        for (auto light = lights_.rbegin(); light != lights_.rend(); ++light) {
             const Spectrum seen = light->emitter->eval(si, active);
             if (!light->is_cap || dr::any(seen != 0.f)) return seen;
         }
@@ -50,16 +49,16 @@ class Environments final : public Emitter<Float, Spectrum> {
     std::pair<DirectionSample3f, Spectrum> sample_direction(const Interaction3f& it, const Point2f& sample,
                                                             Mask active) const override {
         // One of the lights, each as often; the sample is stretched to be used again.
-        const auto count = static_cast<float>(m_lights.size());
+        const auto count = static_cast<float>(lights_.size());
         const float chosen = std::min(std::floor(sample.x() * count), count - 1.f);
         const Point2f reused(sample.x() * count - chosen, sample.y());
-        const Light& light = m_lights[static_cast<size_t>(chosen)];
+        const Light& light = lights_[static_cast<size_t>(chosen)];
         auto [direction, weight] = light.emitter->sample_direction(it, reused, active);
         if (!(direction.pdf > 0.f)) return {direction, Spectrum(0.f)};
         // What the light itself says of its sample is exact; asked for the same direction, it may round.
         Spectrum value = weight * direction.pdf;
         const SurfaceInteraction3f seen = seen_in(direction);
-        for (const Light& other : m_lights) {
+        for (const Light& other : lights_) {
             if (&other == &light) continue;
             value += other.emitter->eval(seen, active);
             direction.pdf += other.emitter->pdf_direction(it, direction, active);
@@ -72,15 +71,15 @@ class Environments final : public Emitter<Float, Spectrum> {
     Float pdf_direction(const Interaction3f& it, const DirectionSample3f& direction,
                         Mask active) const override {
         Float sum = 0.f;
-        for (const Light& light : m_lights) sum += light.emitter->pdf_direction(it, direction, active);
-        return sum / static_cast<float>(m_lights.size());
+        for (const Light& light : lights_) sum += light.emitter->pdf_direction(it, direction, active);
+        return sum / static_cast<float>(lights_.size());
     }
 
     // What comes from a direction in all.
     Spectrum eval_direction(const Interaction3f& /*it*/, const DirectionSample3f& direction,
                             Mask active) const override {
         Spectrum sum(0.f);
-        for (const Light& light : m_lights) sum += light.emitter->eval(seen_in(direction), active);
+        for (const Light& light : lights_) sum += light.emitter->eval(seen_in(direction), active);
         return sum;
     }
 
@@ -103,9 +102,9 @@ class Environments final : public Emitter<Float, Spectrum> {
         return si;
     }
 
-    std::vector<Light> m_lights;
+    std::vector<Light> lights_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(Environments)
+TUNGSTEN_EXPORT_PLUGIN(Environments<float, Rgb>)

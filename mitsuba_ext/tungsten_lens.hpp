@@ -3,20 +3,20 @@
 // eye.
 #pragma once
 
-#include <mitsuba/core/properties.h>
 #include <mitsuba/core/warp.h>
 #include <mitsuba/render/sensor.h>
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
+
+#include "tungsten_plugin.hpp"
 
 namespace mitsuba {
 
 // Positions on the lens are in the camera's frame as Mitsuba has it, in which x points to the left.
 class TungstenLens {
   public:
-    using Variant = RenderAliases<float, Color<float, 3>>;
+    using Variant = RenderAliases<float, Rgb>;
 
     explicit TungstenLens(const Properties& properties)
         : blades_(properties.get<int>("lens_blades", 0)),
@@ -32,7 +32,7 @@ class TungstenLens {
         // A point of the triangle between the middle and two corners.
         const float from_middle = std::sqrt(scaled - blade);
         const auto corner = [&](float index) {
-            const float phi = angle_ + index * 2.f * std::numbers::pi_v<float> / static_cast<float>(blades_);
+            const float phi = angle_ + index * two_pi / static_cast<float>(blades_);
             return Point<float, 2>(-std::cos(phi), std::sin(phi));
         };
         const Point<float, 2> position =

@@ -14,8 +14,8 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture)
 
     explicit OrenNayar(const Properties& props) : Base(props) {
-        m_albedo = props.get_texture<Texture>("albedo", 1.f);
-        m_roughness = props.get_texture<Texture>("roughness", 1.f);
+        albedo_ = props.get_texture<Texture>("albedo", 1.f);
+        roughness_ = props.get_texture<Texture>("roughness", 1.f);
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
 
@@ -44,34 +44,34 @@ class OrenNayar final : public TungstenBsdf<Float, Spectrum> {
         const Float norm = std::sqrt(radii * radii_o);
         const Float cos_phi = norm == 0.f ? 1.f : (wi.x() * wo.x() + wi.y() * wo.y()) / norm;
 
-        const Float variance = 0.5f * squared(m_roughness->eval_1(si));
+        const Float variance = 0.5f * squared(roughness_->eval_1(si));
         const Float c1 = 1.f - 0.5f * variance / (variance + 0.33f);
-        const Float beta_of_right = 2.f * kInvPi * beta;
+        const Float beta_of_right = 2.f * inv_pi * beta;
         const Float bend = cos_phi >= 0.f ? 0.f : beta_of_right * beta_of_right * beta_of_right;
         const Float c2 = 0.45f * variance / (variance + 0.09f) * (std::sin(alpha) - bend);
         const Float c3 =
-            0.125f * variance / (variance + 0.09f) * squared(4.f * squared(kInvPi) * alpha * beta);
+            0.125f * variance / (variance + 0.09f) * squared(4.f * squared(inv_pi) * alpha * beta);
         const Float direct = c1 + cos_phi * c2 * std::tan(beta) +
                              (1.f - std::abs(cos_phi)) * c3 * std::tan(0.5f * (alpha + beta));
         const Float interreflected =
             0.17f * variance / (variance + 0.13f) * (1.f - cos_phi * squared(beta_of_right));
 
-        const Spectrum albedo = m_albedo->eval(si);
+        const Spectrum albedo = albedo_->eval(si);
         const Float share = uniform_share(si);
-        return {(albedo * direct + albedo * albedo * interreflected) * (wo.z() * kInvPi),
-                share / kTwoPi + (1.f - share) * wo.z() * kInvPi};
+        return {(albedo * direct + albedo * albedo * interreflected) * (wo.z() * inv_pi),
+                share / two_pi + (1.f - share) * wo.z() * inv_pi};
     }
 
   private:
     // How often directions are drawn uniformly and not by the cosine.
     Float uniform_share(const SurfaceInteraction3f& si) const {
-        return std::clamp(m_roughness->eval_1(si), 0.01f, 1.f);
+        return std::clamp(roughness_->eval_1(si), 0.01f, 1.f);
     }
 
-    ref<Texture> m_albedo;
-    ref<Texture> m_roughness;
+    ref<Texture> albedo_;
+    ref<Texture> roughness_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(OrenNayar)
+TUNGSTEN_EXPORT_PLUGIN(OrenNayar<float, Rgb>)

@@ -26,7 +26,6 @@
 // own.
 
 #include <drjit/random.h>
-#include <mitsuba/core/properties.h>
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/emitter.h>
@@ -49,7 +48,6 @@
 #include <functional>
 #include <map>
 #include <memory>
-#include <numbers>
 #include <optional>
 #include <sstream>
 #include <string>
@@ -57,12 +55,12 @@
 #include <vector>
 
 #include "tungsten_lens.hpp"
+#include "tungsten_plugin.hpp"
 
 namespace mitsuba {
 namespace {
 
-using Variant = RenderAliases<float, Color<float, 3>>;
-using Rgb = Color<float, 3>;
+using Variant = RenderAliases<float, Rgb>;
 using Vector2 = Vector<float, 2>;
 using Vector3 = Vector<float, 3>;
 using Point2 = Point<float, 2>;
@@ -143,7 +141,6 @@ class FilterTable {
         if (name == "catmull_rom") return {[](float x) { return cubic(x, 0.f, 0.5f); }, 2.f};
         if (name == "lanczos")
             return {[](float x) {
-                        constexpr float pi = std::numbers::pi_v<float>;
                         return x == 0.f ? 1.f
                                         : 2.f * std::sin(pi * x) * std::sin(pi * x / 2.f) / (pi * pi * x * x);
                     },
@@ -669,9 +666,4 @@ class TungstenPath final : public Variant::Integrator {
 }  // namespace
 }  // namespace mitsuba
 
-extern "C" __attribute__((visibility("default"))) void init_plugin(std::string_view name,
-                                                                   mitsuba::PluginRegisterFn add) {
-    add(name, "scalar_rgb", mitsuba::TungstenPath::Type, [](void*, const mitsuba::Properties& properties) {
-        return mitsuba::ref<mitsuba::Object>(new mitsuba::TungstenPath(properties));
-    });
-}
+TUNGSTEN_EXPORT_PLUGIN(TungstenPath)

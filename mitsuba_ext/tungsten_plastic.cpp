@@ -16,19 +16,19 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture)
 
     explicit Plastic(const Properties& props) : Base(props) {
-        m_albedo = props.get_texture<Texture>("albedo", 1.f);
-        m_ior = props.get<float>("ior", 1.5f);
-        m_sigma_a = props.get<Color3f>("sigma_a", Color3f(0.f));
-        m_absorbs = dr::max(m_sigma_a) > 0.f;
-        m_diffuse_fresnel = diffuse_fresnel_inside(m_ior);
-        m_base_weight = std::exp(-2.f * dr::mean(m_sigma_a));
+        albedo_ = props.get_texture<Texture>("albedo", 1.f);
+        ior_ = props.get<float>("ior", 1.5f);
+        sigma_a_ = props.get<Color3f>("sigma_a", Color3f(0.f));
+        absorbs_ = dr::max(sigma_a_) > 0.f;
+        diffuse_fresnel_ = diffuse_fresnel_inside(ior_);
+        base_weight_ = std::exp(-2.f * dr::mean(sigma_a_));
         if (props.has_property("roughness")) {
-            m_roughness = props.get_texture<Texture>("roughness", 0.02f);
-            m_distribution =
+            roughness_ = props.get_texture<Texture>("roughness", 0.02f);
+            distribution_ =
                 RoughReflection::distribution_from_name(props.get<std::string>("distribution", "ggx"));
-            m_base_weight *= m_albedo->mean();
+            base_weight_ *= albedo_->mean();
         }
-        Base::add_component((m_roughness ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection) |
+        Base::add_component((roughness_ ? BSDFFlags::GlossyReflection : BSDFFlags::DeltaReflection) |
                             BSDFFlags::FrontSide);
         Base::add_component(BSDFFlags::DiffuseReflection | BSDFFlags::FrontSide);
     }
@@ -38,13 +38,13 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
                                              Mask active) const override {
         const Vector3f& wi = si.wi;
         if (!active || wi.z() <= 0.f) return {dr::zeros<BSDFSample3f>(), Spectrum(0.f)};
-        const Float reflectance = dielectric_fresnel(1.f / m_ior, wi.z()).reflectance;
+        const Float reflectance = dielectric_fresnel(1.f / ior_, wi.z()).reflectance;
         const Float probability = specular_probability(reflectance);
         if (sample1 >= probability)
             return Base::weighted(
                 Base::sample_of(warp::square_to_cosine_hemisphere(sample2), BSDFFlags::DiffuseReflection, 1),
                 si);
-        if (m_roughness)
+        if (roughness_)
             return Base::weighted(
                 Base::sample_of(layer(si).sample(wi, sample2), BSDFFlags::GlossyReflection, 0), si);
         BSDFSample3f bs = Base::sample_of(Vector3f(-wi.x(), -wi.y(), wi.z()), BSDFFlags::DeltaReflection, 0);
@@ -58,16 +58,16 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
         const Vector3f& wi = si.wi;
         if (wi.z() <= 0.f || wo.z() <= 0.f) return {Spectrum(0.f), 0.f};
-        const Float reflectance_i = dielectric_fresnel(1.f / m_ior, wi.z()).reflectance;
-        const Float reflectance_o = dielectric_fresnel(1.f / m_ior, wo.z()).reflectance;
+        const Float reflectance_i = dielectric_fresnel(1.f / ior_, wi.z()).reflectance;
+        const Float reflectance_o = dielectric_fresnel(1.f / ior_, wo.z()).reflectance;
         const Float probability = specular_probability(reflectance_i);
 
-        const Spectrum albedo = m_albedo->eval(si);
-        Spectrum value = albedo / (1.f - albedo * m_diffuse_fresnel) *
-                         ((1.f - reflectance_i) * (1.f - reflectance_o) * wo.z() * kInvPi / squared(m_ior));
-        if (m_absorbs) value *= dr::exp(-m_sigma_a * (1.f / wo.z() + 1.f / wi.z()));
-        Float density = (1.f - probability) * wo.z() * kInvPi;
-        if (m_roughness) {
+        const Spectrum albedo = albedo_->eval(si);
+        Spectrum value = albedo / (1.f - albedo * diffuse_fresnel_) *
+                         ((1.f - reflectance_i) * (1.f - reflectance_o) * wo.z() * inv_pi / squared(ior_));
+        if (absorbs_) value *= dr::exp(-sigma_a_ * (1.f / wo.z() + 1.f / wi.z()));
+        Float density = (1.f - probability) * wo.z() * inv_pi;
+        if (roughness_) {
             const RoughReflection reflection = layer(si);
             value += reflection.eval(wi, wo);
             density += probability * reflection.pdf(wi, wo);
@@ -77,23 +77,23 @@ class Plastic final : public TungstenBsdf<Float, Spectrum> {
 
   private:
     Float specular_probability(Float reflectance) const {
-        return reflectance / (reflectance + m_base_weight * (1.f - reflectance));
+        return reflectance / (reflectance + base_weight_ * (1.f - reflectance));
     }
 
     RoughReflection layer(const SurfaceInteraction3f& si) const {
-        return {m_distribution, m_roughness->eval_1(si), m_ior};
+        return {distribution_, roughness_->eval_1(si), ior_};
     }
 
-    ref<Texture> m_albedo;
-    ref<Texture> m_roughness;
-    RoughReflection::Distribution m_distribution = RoughReflection::Distribution::Ggx;
-    float m_ior;
-    Color3f m_sigma_a;
-    bool m_absorbs;
-    float m_diffuse_fresnel;
-    float m_base_weight;
+    ref<Texture> albedo_;
+    ref<Texture> roughness_;
+    RoughReflection::Distribution distribution_ = RoughReflection::Distribution::Ggx;
+    float ior_;
+    Color3f sigma_a_;
+    bool absorbs_;
+    float diffuse_fresnel_;
+    float base_weight_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(Plastic)
+TUNGSTEN_EXPORT_PLUGIN(Plastic<float, Rgb>)

@@ -16,10 +16,10 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
     MI_IMPORT_TYPES(Texture)
 
     explicit ThinSheet(const Properties& props) : Base(props) {
-        m_ior = props.get<float>("ior", 1.5f);
-        m_interference = props.get<bool>("interference", false);
-        m_thickness = props.get_texture<Texture>("thickness", 0.5f);
-        m_sigma_a = props.get<Color3f>("sigma_a", Color3f(0.f));
+        ior_ = props.get<float>("ior", 1.5f);
+        interference_ = props.get<bool>("interference", false);
+        thickness_ = props.get_texture<Texture>("thickness", 0.5f);
+        sigma_a_ = props.get<Color3f>("sigma_a", Color3f(0.f));
         Base::add_component(BSDFFlags::DeltaReflection | BSDFFlags::FrontSide | BSDFFlags::BackSide);
         Base::add_component(BSDFFlags::Null | BSDFFlags::FrontSide | BSDFFlags::BackSide);
     }
@@ -56,17 +56,17 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
   private:
     // Reflectance and transmittance of the film as a whole.
     std::pair<Spectrum, Spectrum> split(const SurfaceInteraction3f& si) const {
-        const Float eta = 1.f / m_ior;
+        const Float eta = 1.f / ior_;
         const Float cos_i = std::abs(si.wi.z());
         const Float sin_t_squared = eta * eta * (1.f - cos_i * cos_i);
         if (sin_t_squared > 1.f) return {Spectrum(1.f), Spectrum(0.f)};
         const Float cos_t = std::sqrt(1.f - sin_t_squared);
-        const Float thickness = m_thickness->eval_1(si);
+        const Float thickness = thickness_->eval_1(si);
         const Spectrum reflectance =
-            m_interference ? interfering(eta, cos_i, cos_t, 500.f * thickness) : summed(eta, cos_i, cos_t);
+            interference_ ? interfering(eta, cos_i, cos_t, 500.f * thickness) : summed(eta, cos_i, cos_t);
         Spectrum transmittance = 1.f - reflectance;
-        if (dr::max(m_sigma_a) > 0.f && cos_t > 0.f)
-            transmittance *= dr::exp(-m_sigma_a * (2.f * thickness / cos_t));
+        if (dr::max(sigma_a_) > 0.f && cos_t > 0.f)
+            transmittance *= dr::exp(-sigma_a_ * (2.f * thickness / cos_t));
         return {reflectance, transmittance};
     }
 
@@ -83,19 +83,19 @@ class ThinSheet final : public TungstenBsdf<Float, Spectrum> {
         const Float r_s = 1.f - t_s;
         const Float r_p = 1.f - t_p;
         const Spectrum wavelengths(650.f, 510.f, 475.f);
-        const Spectrum cos_phase = dr::cos(2.f * kTwoPi * thickness * cos_t * m_ior / wavelengths);
+        const Spectrum cos_phase = dr::cos(2.f * two_pi * thickness * cos_t * ior_ / wavelengths);
         const auto through = [&](Float t, Float r) {
             return Spectrum(squared(t) / (squared(r) + 1.f - 2.f * r * cos_phase));
         };
         return 1.f - 0.5f * (through(t_s, r_s) + through(t_p, r_p));
     }
 
-    ref<Texture> m_thickness;
-    Color3f m_sigma_a;
-    float m_ior;
-    bool m_interference;
+    ref<Texture> thickness_;
+    Color3f sigma_a_;
+    float ior_;
+    bool interference_;
 };
 
 }  // namespace mitsuba
 
-TUNGSTEN_EXPORT_PLUGIN(ThinSheet)
+TUNGSTEN_EXPORT_PLUGIN(ThinSheet<float, Rgb>)
