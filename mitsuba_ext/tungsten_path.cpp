@@ -406,6 +406,7 @@ class TungstenPath final : public Variant::Integrator {
                   .is_recorded = !records_features_,
                   .segment_start = ray.o};
         while ((path.hit.is_valid() || path.medium != nullptr) && path.bounce < max_bounces_) {
+            if (should_stop()) return path.radiance;
             auto medium_hit = dr::zeros<MediumHit>();
             const bool in_medium = path.medium != nullptr && scatters(*path.medium, path.ray, path.hit.t,
                                                                       random, path.throughput, medium_hit);
@@ -638,7 +639,7 @@ class TungstenPath final : public Variant::Integrator {
             if (!is_hit) return bounce >= min_bounces_ ? result : Rgb(0.f);
             const SurfaceHit hit = preliminary.compute_surface_interaction(ray);
             result *= hit.bsdf()->eval_null_transmission(hit);
-            if (is_black(result) || ++bounce >= max_bounces_) return {0.f};
+            if (is_black(result) || ++bounce >= max_bounces_ || should_stop()) return {0.f};
             if (hit.is_medium_transition()) medium = hit.target_medium(ray.d);
             ray = hit.spawn_ray_to(target);
         }

@@ -18,7 +18,8 @@ from tungsten_dip.buffers import read_buffers, write_denoised
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings
-from tungsten_dip.hosts.mitsuba.render import _Statistics, render_translated
+from tungsten_dip.hosts.mitsuba.render import _scene_with_integrator, _Statistics, render_translated
+from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.scene.types import PathTracer
 
@@ -450,6 +451,25 @@ def test_a_failing_progress_callback_ends_the_render() -> None:
 
     with pytest.raises(ZeroDivisionError):
         render_translated(ball((256, 256)), spp=1_000_000, progress=fail)
+
+
+def test_cancel_ends_a_path_without_end() -> None:
+    mirror = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+    hall = scene(
+        placed("sphere", "mirror", scale=9),
+        bsdfs={"mirror": (mirror, 1.0)},
+        trace=PathTracer(max_bounces=2**31 - 1),
+    )
+    with mitsuba_variant():
+        loaded = mi.load_dict(_scene_with_integrator(hall, 1, ALL))
+    integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+    path = threading.Thread(target=integrator.render, args=(loaded, sensor, 0, 1), daemon=True)
+    path.start()
+    path.join(1.0)
+    assert path.is_alive()
+    integrator.cancel()
+    path.join(60.0)
+    assert not path.is_alive()
 
 
 @pytest.mark.parametrize(
