@@ -1,9 +1,11 @@
 // tungsten_environments: several lights that surround the scene, such as a sky and the sun in it.
 //
-//   light_0, light_1, ...   the emitters, each of which surrounds the scene
-//   cap_0, cap_1, ...       bool: the light leaves the others visible where it is black
+//   light_0, light_1, ...       the emitters, each of which surrounds the scene
+//   cap_0, cap_1, ...           bool: the light leaves the others visible where it is never sampled
+//   sampled_0, sampled_1, ...   bool: the light lights surfaces even where a later one hides it
 //
-// As in Tungsten, surfaces are lit by all of them, and a ray that leaves the scene sees the last alone.
+// As in Tungsten, a ray that leaves the scene sees the last light in its direction alone; surfaces are lit by
+// all that are sampled, and by what their rays see.
 #include <mitsuba/render/emitter.h>
 
 #include <algorithm>
@@ -27,7 +29,8 @@ class Environments final : public Emitter<Float, Spectrum> {
             auto* emitter = dynamic_cast<Base*>(nested.get());
             if (emitter == nullptr || !emitter->is_environment())
                 Throw("Expected emitters that surround the scene");
-            lights_.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false)});
+            lights_.push_back({emitter, props.get<bool>("cap_" + std::to_string(i), false),
+                               props.get<bool>("sampled_" + std::to_string(i), true)});
         }
         if (lights_.empty()) Throw("Expected nested emitters");
         m_flags = +EmitterFlags::Infinite;
@@ -39,11 +42,10 @@ class Environments final : public Emitter<Float, Spectrum> {
 
     // What a ray sees.
     Spectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
-        for (auto light = lights_.rbegin(); light != lights_.rend(); ++light) {
-            const Spectrum seen = light->emitter->eval(si, active);
-            if (!light->is_cap || dr::any(seen != 0.f)) return seen;
-        }
-        return Spectrum(0.f);
+        auto direction = dr::zeros<DirectionSample3f>();
+        direction.d = -si.wi;
+        const Light* seen = last_towards(direction);
+        return seen != nullptr ? Spectrum(seen->emitter->eval(si, active)) : Spectrum(0.f);
     }
 
     std::pair<DirectionSample3f, Spectrum> sample_direction(const Interaction3f& it, const Point2f& sample,
@@ -56,11 +58,11 @@ class Environments final : public Emitter<Float, Spectrum> {
         auto [direction, weight] = light.emitter->sample_direction(it, reused, active);
         if (!(direction.pdf > 0.f)) return {direction, Spectrum(0.f)};
         // What the light itself says of its sample is exact; asked for the same direction, it may round.
-        Spectrum value = weight * direction.pdf;
-        const SurfaceInteraction3f seen = seen_in(direction);
+        const Light* seen = last_towards(direction);
+        Spectrum value = lights_up(light, seen) ? weight * direction.pdf : Spectrum(0.f);
         for (const Light& other : lights_) {
             if (&other == &light) continue;
-            value += other.emitter->eval(seen, active);
+            if (lights_up(other, seen)) value += other.emitter->eval(seen_in(direction), active);
             direction.pdf += other.emitter->pdf_direction(it, direction, active);
         }
         direction.pdf /= count;
@@ -78,8 +80,10 @@ class Environments final : public Emitter<Float, Spectrum> {
     // What comes from a direction in all.
     Spectrum eval_direction(const Interaction3f& /*it*/, const DirectionSample3f& direction,
                             Mask active) const override {
+        const Light* seen = last_towards(direction);
         Spectrum sum(0.f);
-        for (const Light& light : lights_) sum += light.emitter->eval(seen_in(direction), active);
+        for (const Light& light : lights_)
+            if (lights_up(light, seen)) sum += light.emitter->eval(seen_in(direction), active);
         return sum;
     }
 
@@ -93,7 +97,22 @@ class Environments final : public Emitter<Float, Spectrum> {
     struct Light {
         ref<Base> emitter;
         bool is_cap;
+        bool is_sampled;
     };
+
+    // The light that a ray sees, if any.
+    const Light* last_towards(const DirectionSample3f& direction) const {
+        const auto it = dr::zeros<Interaction3f>();
+        const auto light = std::find_if(lights_.rbegin(), lights_.rend(), [&](const Light& candidate) {
+            return !candidate.is_cap || candidate.emitter->pdf_direction(it, direction, true) > 0.f;
+        });
+        return light != lights_.rend() ? &*light : nullptr;
+    }
+
+    // Whether surfaces receive what a light sends from a direction in which rays see `seen`.
+    static bool lights_up(const Light& light, const Light* seen) {
+        return light.is_sampled || &light == seen;
+    }
 
     // Lights around the scene want a ray that hit nothing; their `eval_direction` wants coordinates in a map.
     static SurfaceInteraction3f seen_in(const DirectionSample3f& direction) {

@@ -15,6 +15,9 @@ from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
 
+Surrounding = ts.InfiniteSphere | ts.InfiniteSphereCap | ts.Skydome
+"""What lights a scene from infinitely far away."""
+
 # Mitsuba's azimuth in an environment map starts at -z and Tungsten's at -x.
 _ENVMAP_AXES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -34,7 +37,7 @@ def point_node(t: Translation, primitive: ts.Point) -> Node | None:
     }
 
 
-def environment_node(t: Translation, primitive: ts.Primitive) -> Node | None:
+def environment_node(t: Translation, primitive: Surrounding) -> Node | None:
     """Return the Mitsuba emitter of a light that surrounds the scene, or None where it does not shine.
 
     Raises InputError for a texture without counterpart.
@@ -61,16 +64,17 @@ def default_environment() -> Node:
     return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
 
 
-def together(environments: Sequence[tuple[Node, bool]]) -> Node:
-    """Return one emitter for all lights around the scene, since Mitsuba knows but one.
-
-    Every light comes with whether it is a cap, which leaves the others visible beside it.
-    """
-    if len(environments) == 1:
-        return environments[0][0]
+def together(surroundings: Sequence[tuple[Node, Surrounding]]) -> Node:
+    """Return one emitter for all lights around the scene, since Mitsuba knows but one."""
+    if len(surroundings) == 1:
+        return surroundings[0][0]
     node: Node = {"type": "tungsten_environments"}
-    for number, (light, is_cap) in enumerate(environments):
-        node |= {f"light_{number}": light, f"cap_{number}": is_cap}
+    for number, (light, primitive) in enumerate(surroundings):
+        node |= {
+            f"light_{number}": light,
+            f"cap_{number}": isinstance(primitive, ts.InfiniteSphereCap),
+            f"sampled_{number}": primitive.sample,
+        }
     return node
 
 

@@ -6,9 +6,9 @@ What agrees, what is approximated (and by how much) and what is refused stands i
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 
 from tungsten_dip.hosts.mitsuba.emitters import (
+    Surrounding,
     default_environment,
     environment_node,
     point_node,
@@ -32,8 +32,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     t = Translation(scene)
     integrator = _path_tracer(t, scene.integrator)
     lights = 0
-    surroundings: list[tuple[Node, bool]] = []
-    hidden = _hidden_lights(scene.primitives)
+    surroundings: list[tuple[Node, Surrounding]] = []
     for number, primitive in enumerate(scene.primitives):
         t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
         match primitive:
@@ -41,8 +40,8 @@ def translate(scene: ts.Scene) -> TranslatedScene:
                 node = point_node(t, primitive)
             case ts.InfiniteSphere() | ts.InfiniteSphereCap() | ts.Skydome():
                 node = environment_node(t, primitive)
-                if node is not None and primitive not in hidden:
-                    surroundings.append((node, isinstance(primitive, ts.InfiniteSphereCap)))
+                if node is not None:
+                    surroundings.append((node, primitive))
                 continue
             case _:
                 lights += add_shapes(t, primitive)
@@ -63,18 +62,6 @@ def translate(scene: ts.Scene) -> TranslatedScene:
         pixel_center(scene.camera),
         lens_of_integrator(t, scene.camera),
     )
-
-
-def _hidden_lights(primitives: Sequence[ts.Primitive]) -> set[ts.Primitive]:
-    """Return the lights around the scene that nothing finds: not sampled, and behind a later one."""
-    hidden: set[ts.Primitive] = set()
-    is_covered = False
-    for primitive in reversed(primitives):
-        if isinstance(primitive, ts.InfiniteSphere | ts.InfiniteSphereCap | ts.Skydome):
-            if is_covered and not primitive.sample:
-                hidden.add(primitive)
-            is_covered |= not isinstance(primitive, ts.InfiniteSphereCap)
-    return hidden
 
 
 def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
