@@ -2,7 +2,7 @@
 //
 //   direction    vector: towards the middle of the light
 //   cap_angle    float: from there to its edge, in radians
-//   radiance     the texture of the radiance, of one colour
+//   radiance     texture; the radiance is its value at UV (0, 0)
 //
 // Small angles keep their digits: 1 - cos is computed as 2 sin^2 of half the angle throughout.
 #include <mitsuba/core/frame.h>
@@ -38,7 +38,7 @@ class Cap final : public Emitter<Float, Spectrum> {
     }
 
     Spectrum eval(const SurfaceInteraction3f& si, Mask active) const override {
-        return covers(-si.wi) ? radiance_->eval(si, active) : Spectrum(0.f);
+        return covers(-si.wi) ? radiance(active) : Spectrum(0.f);
     }
 
     std::pair<DirectionSample3f, Spectrum> sample_direction(const Interaction3f& it, const Point2f& sample,

@@ -386,6 +386,29 @@ def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
     np.testing.assert_allclose(means[0], means[1], rtol=0.02)
 
 
+def test_a_cap_has_the_one_colour_of_its_texture_at_the_origin_of_uv(folder: Path) -> None:
+    rng = np.random.default_rng(3)
+    pixels = rng.random((3, 4, 3)).astype(np.float32)
+    write_image(folder / "sun.pfm", pixels)
+    colours: list[tuple[Json | str, Any]] = [
+        # Between the texels at all four corners of the image, which repeats.
+        ("sun.pfm", pixels[[0, 0, -1, -1], [0, -1, 0, -1]].mean(axis=0)),
+        ({"type": "bitmap", "file": "sun.pfm", "clamp": True, "scale": 2}, 2 * pixels[-1, 0]),
+        ({"type": "bitmap", "file": "sun.pfm", "interpolate": False}, pixels[0, 0]),
+        ({"type": "checker", "on_color": 3, "off_color": 2}, [2, 2, 2]),
+        ({"type": "disk", "value": 2}, [0, 0, 0]),
+        ({"type": "blade", "value": 2}, [2, 2, 2]),
+    ]
+    up = {"transform": {"position": [0, 1, 0], "look_at": [0, 2, 0], "up": [0, 0, 1]}, "fov": 4}
+    for texture, colour in colours:
+        sun = {"type": "infinite_sphere_cap", "cap_angle": 10, "emission": texture}
+        seen = render(folder, [WHITE_SKY, sun], up).color.mean
+        np.testing.assert_allclose(seen, np.broadcast_to(colour, seen.shape), rtol=1e-4)
+        lit = render(folder, [FLOOR, sun], DOWN, spp=64).color.mean.mean(axis=(0, 1))
+        expected = 0.5 * np.asarray(colour) * math.sin(math.radians(10)) ** 2
+        np.testing.assert_allclose(lit, expected, rtol=0.02)
+
+
 def test_a_sun_as_small_as_the_real_one_beside_a_sky(folder: Path) -> None:
     sun = {"type": "infinite_sphere_cap", "cap_angle": 0.27, "emission": 5e4}
     lit = render(folder, [FLOOR, WHITE_SKY, sun], DOWN, spp=64).color.mean

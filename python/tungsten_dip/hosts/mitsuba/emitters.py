@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
-from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines
+from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines, texture_node
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
 
@@ -95,18 +95,19 @@ def envmap_node(
 
 
 def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node | None:
-    if not isinstance(texture, ts.ConstantTexture):
-        raise t.unsupported(f"an infinite_sphere_cap with a texture of type {texture.kind}")
     if primitive.cap_angle == 0.0:
         return None
     angle = math.radians(primitive.cap_angle)
     solid_angle = 4.0 * math.pi * math.sin(angle / 2.0) ** 2
     scale = 1.0 / solid_angle if primitive.power is not None else 1.0
+    # Tungsten takes the one colour at UV (0, 0), where its blade textures have theirs, whatever they cover.
+    if isinstance(texture, ts.BladeTexture):
+        texture = ts.ConstantTexture(value=texture.value)
     return {
         "type": "tungsten_cap",
         "direction": [float(x) for x in primitive.world_from_local[:3, 1]],
         "cap_angle": angle,
-        "radiance": constant(_scaled(texture.value, scale)),
+        "radiance": texture_node(t, texture, "rgb", scale=scale),
     }
 
 
