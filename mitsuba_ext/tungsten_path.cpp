@@ -521,7 +521,8 @@ class TungstenPath final : public Variant::Integrator {
                               const Path& path) const {
         const Rgb seen = emitter.eval(hit);
         if (path.was_specular || !path.samples_lights) return seen;
-        const Variant::DirectionSample3f towards(&scene, hit, path.vertex);
+        Variant::DirectionSample3f towards(&scene, hit, path.vertex);
+        towards.n = hit.n;  // of the face, by which lights are sampled
         // Of several lights around the scene a ray sees one, but all light a surface. (The others' own
         // `eval_direction` wants coordinates in their map, which only their samples have.)
         const bool all_light = surrounded_by_several_ && &emitter == scene.environment();

@@ -161,6 +161,40 @@ def under(*lights: dict[str, Any]) -> dict[str, Any]:
     return scene
 
 
+def lit_by_a_bowl() -> dict[str, Any]:
+    """The room under a shining mesh, smooth, whose vertex normals differ much from those of its faces."""
+    scene = copy.deepcopy(ROOM)
+    scene["primitives"][-2:] = [
+        {
+            "type": "mesh",
+            "file": "bowl.obj",
+            "smooth": True,
+            "bsdf": "red",
+            "emission": "heights.png",
+            "transform": {"position": [0, 1.2, 0]},
+        }
+    ]
+    return scene
+
+
+BOWL = """v -1 0 -1
+v 1 0 -1
+v 1 0 1
+v -1 0 1
+v 0 0.5 0
+vt 0 0
+vt 1 0
+vt 1 1
+vn -0.6 -0.8 0
+vn 0.6 -0.8 0
+vn 0 1 0
+f 1/1/1 2/2/2 5/3/3
+f 2/1/2 3/2/2 5/3/3
+f 3/1/2 4/2/1 5/3/3
+f 4/1/1 1/2/1 5/3/3
+"""
+
+
 def glazed() -> dict[str, Any]:
     """The room with rough coats over metal and a mirror, and glass that reflects alone."""
     scene = copy.deepcopy(ROOM)
@@ -188,6 +222,15 @@ CASES = {
         {"type": "infinite_sphere_cap", "cap_angle": 20, "emission": 9, "sample": False},
         {"type": "infinite_sphere", "emission": 0.5},
     ),
+    "unsampled sky behind a sun": under(
+        {"type": "infinite_sphere", "emission": 0.5, "sample": False},
+        {"type": "infinite_sphere_cap", "cap_angle": 40, "emission": 2},
+    ),
+    "sun of a texture": under(
+        {"type": "infinite_sphere", "emission": 0.1},
+        {"type": "infinite_sphere_cap", "cap_angle": 20, "emission": "heights.png"},
+    ),
+    "smooth mesh that shines": lit_by_a_bowl(),
     "bump": bumpy(),
     "sky and suns": outdoors(),
     "sky map": under(
@@ -225,6 +268,7 @@ CASES = {
 def test_same_picture_up_to_noise(name: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(CASES[name]))
+    (tmp_path / "bowl.obj").write_text(BOWL)
     rows, columns = np.indices((24, 32))
     heights = 128 + 60 * (np.sin(columns * 6 * np.pi / 32) + np.cos(rows * 4 * np.pi / 24))
     image = OpenImageIO.ImageOutput.create(str(tmp_path / "heights.png"))

@@ -355,7 +355,7 @@ def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -
         np.testing.assert_allclose(render(folder, [mirror, *lights], down).color.mean, seen, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["bitmap", "skydome", "cap", "together", "ball"])
+@pytest.mark.parametrize("kind", ["bitmap", "skydome", "cap", "together", "ball", "smooth mesh"])
 def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
     """What paths find by themselves and what they are shown must be the same light."""
     pixels = np.full((8, 16, 3), 0.1, np.float32)
@@ -374,7 +374,9 @@ def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
         "cap": [cap],
         "together": [bitmap, WHITE_SKY],
         "ball": [{**ball(GREY), "emission": 3.0}],
+        "smooth mesh": [{"type": "mesh", "file": "roof.obj", "smooth": True, "bsdf": GREY, "emission": 3.0}],
     }
+    (folder / "roof.obj").write_text(ROOF)
     means = []
     for samples_lights in (True, False):
         integrator = {"type": "path_tracer", "enable_light_sampling": samples_lights}
@@ -437,6 +439,29 @@ def test_a_smooth_mesh_shines_on_the_side_of_its_faces(folder: Path) -> None:
     )
     assert flat > 0.1
     assert smooth == pytest.approx(flat, rel=0.02)
+
+
+ROOF = """v -1 2 -1
+v 1 2 -1
+v 1 2 1
+v -1 2 1
+vn -0.6 0.8 0
+vn 0.6 0.8 0
+f 1//1 2//2 3//2
+f 1//1 3//2 4//1
+"""
+"""A plate that shines downwards and bulges by its vertex normals alone, which point the other way."""
+
+
+def test_a_smooth_mesh_that_shines_stays_smooth(folder: Path) -> None:
+    (folder / "roof.obj").write_text(ROOF)
+    roof = {"type": "mesh", "file": "roof.obj", "smooth": True, "bsdf": GREY}
+    above = {"transform": {"position": [0, 9, 0], "look_at": [0, 2, 0], "up": [0, 0, 1]}, "fov": 10}
+    dark, shining = (
+        render(folder, [{**roof, "emission": emission}, FLOOR], above).normal.mean for emission in (0.0, 5.0)
+    )
+    assert np.ptp(dark[..., 0]) > 0.5
+    np.testing.assert_array_equal(shining, dark)
 
 
 @pytest.mark.parametrize(("name", "opaque"), [("colour.png", True), ("alpha.png", False), ("sky.hdr", False)])

@@ -76,12 +76,9 @@ def emission_node(t: Translation, primitive: ts.Primitive, area: float, uv: Matr
     if texture is None or not shines(t, primitive) or area == 0.0:
         return {}
     scale = 1.0 / (math.pi * area) if primitive.power is not None else 1.0
-    radiance = texture_node(t, texture, "rgb", uv, scale)
-    if not is_constant(texture):
-        if isinstance(primitive, ts.Sphere):
-            raise t.unsupported("a shining sphere with a texture")
-        radiance = {"type": "tungsten_emission", "radiance": radiance}
-    return {"emitter": {"type": "area", "radiance": radiance}}
+    if isinstance(primitive, ts.Sphere) and not is_constant(texture):
+        raise t.unsupported("a shining sphere with a texture")
+    return {"emitter": {"type": "tungsten_area", "radiance": texture_node(t, texture, "rgb", uv, scale)}}
 
 
 def _surroundings(t: Translation, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
@@ -108,9 +105,6 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     if area == 0.0:
         return []
     emission = emission_node(t, primitive, area)
-    if emission:
-        # Mitsuba's lights shine about their shading normals, Tungsten's about those of their faces.
-        normals = None
     materials = np.clip(mesh.materials, 0, len(primitive.bsdf) - 1)
     parts = [(bsdf, materials == number) for number, bsdf in enumerate(primitive.bsdf)]
     if any(height_map(bsdf) for bsdf in primitive.bsdf):
@@ -118,18 +112,16 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
         flat = abs(first[:, 0] * second[:, 1] - second[:, 0] * first[:, 1]) < _LEAST_UV_AREA
         bare = [(replace(bsdf, bump=None), part & flat) for bsdf, part in parts]
         parts = [*((bsdf, part & ~flat) for bsdf, part in parts), *bare]
-    return [
-        _triangles(
-            t,
-            {**_surroundings(t, primitive, bsdf), **emission},
-            positions,
-            mesh.triangles[part],
-            mesh.uvs,
-            normals,
-        )
-        for bsdf, part in parts
-        if part.any()
-    ]
+    shapes = []
+    for bsdf, part in parts:
+        if not part.any():
+            continue
+        triangles = mesh.triangles[part]
+        if emission and normals is not None:
+            emission["emitter"]["faces"] = _triangles(t, {}, positions, triangles, mesh.uvs)
+        node = {**_surroundings(t, primitive, bsdf), **emission}
+        shapes.append(_triangles(t, node, positions, triangles, mesh.uvs, normals))
+    return shapes
 
 
 def _quad(t: Translation, primitive: ts.Quad) -> Any:
