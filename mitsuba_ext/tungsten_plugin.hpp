@@ -3,9 +3,14 @@
 
 #include <mitsuba/core/properties.h>
 #include <mitsuba/core/spectrum.h>
+#include <mitsuba/mitsuba.h>
 
 #include <numbers>
 #include <string_view>
+
+// As runtime.py asks for: a plugin that was compiled against another release would crash in this one.
+static_assert(std::string_view(MI_VERSION) == "3.9.1",
+              "Mitsuba lays out its objects differently in every release: pip install mitsuba==3.9.1");
 
 namespace mitsuba {
 

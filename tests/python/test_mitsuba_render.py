@@ -6,6 +6,7 @@ import importlib.util
 import os
 import signal
 import threading
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.hosts.mitsuba.render import _scene_with_integrator, _Statistics, render_translated
-from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant
+from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.scene.types import PathTracer
 
@@ -490,6 +491,18 @@ def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch: pytest.Monk
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tungsten-dip\[mitsuba\]'"):
         render_translated(ball(), spp=1)
+
+
+def test_plugins_are_built_for_the_release_that_loads_them() -> None:
+    root = Path(__file__).parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text())
+    pins = (root / "constraints.txt").read_text().split()
+    needed = [pin for pin in pins if pin.startswith(("mitsuba==", "nanobind=="))]
+    assert f"mitsuba=={VERSION}" in needed
+    assert set(needed) <= set(project["build-system"]["requires"])
+    assert project["project"]["optional-dependencies"]["mitsuba"] == [f"mitsuba=={VERSION}"]
+    header = (root / "mitsuba_ext" / "tungsten_plugin.hpp").read_text()
+    assert f'static_assert(std::string_view(MI_VERSION) == "{VERSION}"' in header
 
 
 def test_mitsuba_writes_nothing_to_stdout(capfd: pytest.CaptureFixture[str]) -> None:
