@@ -63,7 +63,7 @@ def bsdf_object(
             "shape": shape,
             "consistent": t.source.integrator.enable_consistency_checks,
         }
-    built = t.add_object("bsdf", node)
+    built = t.add("bsdf", node)
     t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
     t.place = outer
     return t.remember(key, built)

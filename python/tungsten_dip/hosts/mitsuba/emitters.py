@@ -64,7 +64,7 @@ def default_environment() -> Node:
     return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
 
 
-def together(surroundings: Sequence[tuple[Node, Surrounding]]) -> Node:
+def together(surroundings: Sequence[tuple[Any, Surrounding]]) -> Any:
     """Return one emitter for all lights around the scene, since Mitsuba knows but one."""
     if len(surroundings) == 1:
         return surroundings[0][0]

@@ -20,8 +20,9 @@ def medium_object(t: Translation, medium: ts.Medium) -> Any:
     found = t.made(key)
     if found is not None:
         return found
-    outer, t.place = t.place, f'medium "{medium.name}"' if medium.name else f"medium of type {medium.kind}"
-    built = t.add_object("medium", _node(t, medium))
+    named = f'medium "{medium.name}"' if medium.name else f"medium of type {medium.kind}"
+    outer, t.place = t.place, f"{t.place}, {named}"
+    built = t.add("medium", _node(t, medium))
     t.place = outer
     return t.remember(key, built)
 

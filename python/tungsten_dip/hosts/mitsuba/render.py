@@ -65,12 +65,8 @@ def render(
     with mitsuba_variant():
         from tungsten_dip.hosts.mitsuba.translate import translate
 
-        try:
-            translated = translate(scene)
-        except RuntimeError as error:
-            raise _cannot_load(error) from None
         return render_translated(
-            translated,
+            translate(scene),
             scene.renderer.spp if spp is None else spp,
             seed,
             threads,
@@ -79,10 +75,6 @@ def render(
             progress,
             quantities,
         )
-
-
-def _cannot_load(error: RuntimeError) -> InputError:
-    return InputError(f"Mitsuba cannot load the scene: {' '.join(str(error).split())}")
 
 
 def render_translated(
@@ -114,7 +106,8 @@ def render_translated(
                 _scene_with_integrator(translated, threads, quantities), parallel=False, optimize=False
             )
         except RuntimeError as error:
-            raise _cannot_load(error) from None
+            reason = " ".join(str(error).split())
+            raise InputError(f"Mitsuba cannot load the scene: {reason}") from None
         done_spp = 0
         statistics: dict[str, _Statistics] = {}
         while done_spp < spp:

@@ -233,6 +233,8 @@ def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
         raise t.unsupported("a file of instances")
     groups = []
     for master in primitive.masters:
+        if isinstance(master, ts.Instances):
+            raise t.unsupported("instances within instances")
         if not isinstance(master, ts.Quad | ts.Disk):
             _log.warning(
                 "%s: %s: Tungsten lights instances of a %s from the wrong places; here they are right",
@@ -256,8 +258,7 @@ def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
         origin, turn, _ = _parts(t, placement.world_from_local)
         place = (primitive.world_from_local @ np.append(origin, 1.0))[:3]
         to_world = transform(_affine(rotation @ turn, place))
-        group = {"type": "ref", "id": groups[placement.id]}
-        nodes.append({"type": "instance", "shapegroup": group, "to_world": to_world})
+        nodes.append({"type": "instance", "shapegroup": groups[placement.id], "to_world": to_world})
     return nodes
 
 

@@ -6,6 +6,7 @@ What agrees, what is approximated (and by how much) and what is refused stands i
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 from tungsten_dip.hosts.mitsuba.emitters import (
     Surrounding,
@@ -17,7 +18,7 @@ from tungsten_dip.hosts.mitsuba.emitters import (
 from tungsten_dip.hosts.mitsuba.sensor import lens_of_integrator, pixel_center, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation
+from tungsten_dip.hosts.mitsuba.translation import Translation, load
 from tungsten_dip.scene import types as ts
 
 _log = logging.getLogger(__name__)
@@ -30,9 +31,16 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     for meshes and images that cannot be read.
     """
     t = Translation(scene)
+    try:
+        return _translated(t, scene)
+    except RuntimeError as error:
+        raise t.refused(error) from None
+
+
+def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
     integrator = _path_tracer(t, scene.integrator)
     lights = 0
-    surroundings: list[tuple[Node, Surrounding]] = []
+    surroundings: list[tuple[Any, Surrounding]] = []
     for number, primitive in enumerate(scene.primitives):
         t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
         match primitive:
@@ -41,7 +49,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
             case ts.InfiniteSphere() | ts.InfiniteSphereCap() | ts.Skydome():
                 node = environment_node(t, primitive)
                 if node is not None:
-                    surroundings.append((node, primitive))
+                    surroundings.append((load(node), primitive))
                 continue
             case _:
                 lights += add_shapes(t, primitive)
@@ -53,7 +61,7 @@ def translate(scene: ts.Scene) -> TranslatedScene:
         t.add("emitter", together(surroundings))
     elif not lights:
         t.add("emitter", default_environment())
-    t.scene["sensor"] = sensor_node(t, scene.camera)
+    t.add("sensor", sensor_node(t, scene.camera))
     return TranslatedScene(
         t.scene,
         t.albedo,

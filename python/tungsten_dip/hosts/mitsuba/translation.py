@@ -36,23 +36,19 @@ class Translation:
 
     def unsupported(self, construct: str) -> InputError:
         """Return the error for what Mitsuba cannot show as Tungsten does."""
-        place = f"{self.place}: " if self.place else ""
-        return InputError(
-            f"{self.source.path}: {place}{construct} has no counterpart in the embedded renderer; "
-            "render with --host tungsten"
+        return self._error(
+            f"{construct} has no counterpart in the embedded renderer; render with --host tungsten"
         )
 
-    def add(self, kind: str, node: Any) -> str:
-        """Add a node (or a Mitsuba object) to the scene and return its id."""
-        name = f"{kind}_{len(self.scene)}"
-        self.scene[name] = node
-        return name
+    def refused(self, error: RuntimeError) -> InputError:
+        """Return the error for what Mitsuba does not load."""
+        reason = " ".join(str(error).split())
+        return self._error(f"Mitsuba cannot load this ({reason}); mend it, or render with --host tungsten")
 
-    def add_object(self, kind: str, node: Node) -> Any:
-        """Build the object that a node describes, add it to the scene under its id and return it."""
+    def add(self, kind: str, node: Any) -> Any:
+        """Add the object that a node describes (or the object) to the scene under its id, and return it."""
         name = f"{kind}_{len(self.scene)}"
-        built = mi.load_dict({**node, "id": name})
-        self.scene[name] = built
+        self.scene[name] = built = load({**node, "id": name}) if isinstance(node, dict) else node
         return built
 
     def made(self, key: tuple[Any, ...]) -> Any | None:
@@ -64,6 +60,18 @@ class Translation:
         self._keep_alive.append(key)
         self._made[_hashable(key)] = result
         return result
+
+    def _error(self, message: str) -> InputError:
+        place = f"{self.place}: " if self.place else ""
+        return InputError(f"{self.source.path}: {place}{message}")
+
+
+def load(node: Node) -> Any:
+    """Return the object that a node describes.
+
+    Raises RuntimeError if Mitsuba refuses it.
+    """
+    return mi.load_dict(node, parallel=False, optimize=False)
 
 
 def constant(value: tuple[float, float, float] | float) -> Node:
