@@ -598,6 +598,16 @@ def test_a_segment_of_a_curve_stays_the_same_curve() -> None:
     np.testing.assert_allclose(evaluated, quadratic, atol=1e-12)
 
 
+def test_every_segment_of_every_curve_is_there(folder: Path) -> None:
+    nodes = np.array([[x, y, 0.1 * y * y] for x in (-0.5, 0.0, 0.5) for y in (0, 0.4, 0.9, 1.5)])
+    segments = np.concatenate([nodes[first : first + 3, None] for first in (0, 1, 4, 5, 8, 9)], axis=1)
+    (strands,) = (shape for shape in loaded(folder, [{**CURVES, "bsdf": GREY}]).shapes())
+    parameters = mitsuba.traverse(strands)
+    np.testing.assert_array_equal(parameters["segment_indices"], np.arange(0, 24, 4))
+    points = np.array(parameters["control_points"]).reshape(6, 4, 4)
+    np.testing.assert_allclose(points[..., :3], cubic_from_quadratic(*segments), atol=1e-6)
+
+
 def test_the_sky_has_the_spectrum_and_the_symmetry_of_the_model(folder: Path) -> None:
     path = folder / "scene.json"
     path.write_text(json.dumps({"primitives": [{"type": "skydome", "intensity": 3}, {"type": "skydome"}]}))

@@ -52,10 +52,8 @@ def curve_shapes(t: Translation, primitive: ts.Curves) -> list[Any]:
     surface = bsdf_object(t, primitive.bsdf, faces_viewer=faces_viewer)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "curves.txt"
-        with path.open("w") as file:
-            for segment in control_points:
-                np.savetxt(file, segment, fmt="%.9g")
-                file.write("\n")
+        # A line for every control point, an empty one after every segment.
+        np.savetxt(path, control_points.reshape(-1, 16), fmt=4 * "%.9g %.9g %.9g %.9g\n")
         return [mi.load_dict({"type": "bsplinecurve", "filename": str(path), surface.id(): surface})]
 
 
