@@ -18,6 +18,7 @@ import OpenImageIO  # noqa: E402
 
 from tungsten_dip.buffers import RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
+from tungsten_dip.hosts.mitsuba import textures  # noqa: E402
 from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render as render_scene  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render_translated  # noqa: E402
@@ -978,6 +979,17 @@ def test_a_broken_image_is_one_line_that_names_it(folder: Path) -> None:
     with pytest.raises(InputError, match=r"broken\.png") as error:
         render(folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": "broken.png"}}])
     assert "\n" not in str(error.value)
+
+
+def test_an_image_too_large_for_memory_is_one_line_that_names_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = {"type": "quad", "bsdf": {"type": "lambert", "albedo": "colour.png"}}
+    monkeypatch.setattr(textures, "MAX_PIXELS", 12)
+    render(folder, [wall])
+    monkeypatch.setattr(textures, "MAX_PIXELS", 11)
+    with pytest.raises(InputError, match=r"colour\.png: [^\n]* at most 11 pixels [^\n]* 5 x 3 in 3; [^\n]*$"):
+        render(folder, [wall])
 
 
 def test_what_is_approximated_is_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO
 
+from tungsten_dip.buffers.image_file import MAX_PIXELS
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform_uv
 from tungsten_dip.scene.types import (
@@ -181,8 +182,15 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     if image is None:
         reason = " ".join(OpenImageIO.geterror().split())
         raise InputError(f"{texture.file}: expected an image for a texture ({reason}); check the file")
+    spec = image.spec()
+    if spec.width * spec.height * spec.nchannels > 4 * MAX_PIXELS:
+        image.close()
+        raise InputError(
+            f"{texture.file}: expected a texture of at most {MAX_PIXELS} pixels in 4 channels, "
+            f"got {spec.width} x {spec.height} in {spec.nchannels}; make it smaller"
+        )
     pixels = image.read_image("float" if hdr else "uint8")
-    error, alpha_channel = image.geterror(), image.spec().alpha_channel
+    error, alpha_channel = image.geterror(), spec.alpha_channel
     image.close()
     if pixels is None or error:
         raise InputError(
