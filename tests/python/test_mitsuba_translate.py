@@ -803,6 +803,26 @@ def test_the_lens_is_sampled_only_where_it_is_open(
     assert sensor.needs_aperture_sample() == samples_lens
 
 
+@pytest.mark.parametrize("kind", ["rough_conductor", "rough_dielectric"])
+def test_no_texel_of_a_roughness_map_is_smoother_than_tungsten_allows(folder: Path, kind: str) -> None:
+    write_image(folder / "smooth.png", np.zeros((2, 2, 3), np.uint8))
+    smooth: list[Json | float | str] = [
+        1e-3,
+        0.0,
+        "smooth.png",
+        {"type": "checker", "on_color": 0, "off_color": 0},
+        {"type": "disk", "value": 0},
+    ]
+    highlights = []
+    for roughness in smooth:
+        (quad,) = loaded(folder, [{"type": "quad", "bsdf": {"type": kind, "roughness": roughness}}]).shapes()
+        hit = mitsuba.SurfaceInteraction3f()
+        hit.uv, hit.wi = [0.5, 0.5], [0, 0, 1]
+        highlights.append(quad.bsdf().eval(mitsuba.BSDFContext(), hit, [0, 0, 1])[0])
+    assert highlights[0] > 0
+    np.testing.assert_allclose(highlights, highlights[0], rtol=1e-4)
+
+
 @pytest.mark.parametrize("used", [False, True])
 def test_media_are_built_only_where_they_fill_something(folder: Path, used: bool) -> None:
     gas = {"name": "gas", "type": "homogeneous", "sigma_s": 1.0}

@@ -218,9 +218,7 @@ def _refraction(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf
 def _microfacets(t: Translation, bsdf: ts.RoughConductorBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
     if bsdf.distribution == "phong":
         raise t.unsupported(f"a {bsdf.kind} of distribution phong")
-    alpha: Node | float = texture_node(t, bsdf.roughness, "average", uv)
-    if isinstance(bsdf.roughness, ts.ConstantTexture):
-        alpha = max(bsdf.roughness.value[0], _SMALLEST_ALPHA)
+    alpha = texture_node(t, bsdf.roughness, "average", uv, least=_SMALLEST_ALPHA)
     return {"distribution": bsdf.distribution, "alpha": alpha}
 
 

@@ -47,19 +47,27 @@ _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade texture
 
 
 def texture_node(
-    t: Translation, texture: Texture, request: Request = "rgb", uv: Matrix = UV, scale: float = 1.0
+    t: Translation,
+    texture: Texture,
+    request: Request = "rgb",
+    uv: Matrix = UV,
+    scale: float = 1.0,
+    least: float = -math.inf,
 ) -> Any:
     """Return the Mitsuba texture of a Tungsten texture times ``scale``, as `mitsuba.load_dict` takes it.
 
-    A bitmap that is used more than once is the same object. Numbers ("average", "alpha_or_average") have one
-    channel, colours three.
+    No texel is below ``least``. A bitmap that is used more than once is the same object. Numbers
+    ("average", "alpha_or_average") have one channel, colours three.
 
     Raises InputError for a type of texture without counterpart and for an image that cannot be read.
     """
     if isinstance(texture, ConstantTexture):
-        return constant(_requested(texture.value, request, scale))
+        return constant(_requested(texture.value, request, scale, least))
     if isinstance(texture, CheckerTexture):
-        on, off = (constant(_requested(c, request, scale)) for c in (texture.on_color, texture.off_color))
+        on, off = (
+            constant(_requested(color, request, scale, least))
+            for color in (texture.on_color, texture.off_color)
+        )
         # Mitsuba's checkerboard swaps its two colours when it is asked for a number.
         first, second = (off, on) if request == "rgb" else (on, off)
         squares = np.diag([texture.res_u / 2, texture.res_v / 2, 1.0]) @ uv
@@ -70,11 +78,12 @@ def texture_node(
             "to_uv": transform_uv(squares),
         }
     if isinstance(texture, BitmapTexture):
-        return _bitmap_object(t, texture, request, uv, scale * texture.scale if texture.interpolate else 1.0)
+        factor = scale * texture.scale if texture.interpolate else 1.0
+        return _bitmap_object(t, texture, request, uv, factor, least)
     if isinstance(texture, DiskTexture | BladeTexture):
         mask = coverage(texture, _SHAPE_RESOLUTION)
-        value = np.atleast_1d(np.asarray(_requested(texture.value, request, scale)))
-        return _bitmap_node(mask[:, :, None] * value, uv, clamp=True, nearest=False)
+        value = np.atleast_1d(np.asarray(_requested(texture.value, request, scale, least)))
+        return _bitmap_node(np.maximum(mask[:, :, None] * value, least), uv, clamp=True, nearest=False)
     raise t.unsupported(f"a texture of type {texture.kind}")
 
 
@@ -140,20 +149,24 @@ def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> npt.NDArra
     return np.asarray(np.clip(inwards * resolution / 2 + 0.5, 0.0, 1.0))
 
 
-def _requested(value: Vec3, request: Request, scale: float) -> Vec3 | float:
-    if request == "rgb":
-        return (value[0] * scale, value[1] * scale, value[2] * scale)
-    return value[0] * scale  # Tungsten takes the first component of a constant, not the mean
+def _requested(value: Vec3, request: Request, scale: float, least: float) -> Vec3 | float:
+    r, g, b = (max(component * scale, least) for component in value)
+    return (
+        (r, g, b) if request == "rgb" else r
+    )  # Tungsten takes the first component of a constant, not the mean
 
 
-def _bitmap_object(t: Translation, texture: BitmapTexture, request: Request, uv: Matrix, scale: float) -> Any:
-    settings = (str(texture.file), request, texture.gamma_correct, texture.clamp, texture.interpolate, scale)
-    key = ("texture", *settings, uv.tobytes().hex())
+def _bitmap_object(
+    t: Translation, texture: BitmapTexture, request: Request, uv: Matrix, scale: float, least: float
+) -> Any:
+    settings = (request, texture.gamma_correct, texture.clamp, texture.interpolate, scale, least)
+    key = ("texture", str(texture.file), *settings, uv.tobytes().hex())
     found = t.made(key)
     if found is None:
         pixels = bitmap_pixels(t, texture, request)
-        scaled = pixels if scale == 1.0 else pixels * np.float32(scale)
-        node = _bitmap_node(scaled, uv, clamp=texture.clamp, nearest=not texture.interpolate)
+        if scale != 1.0 or least > -math.inf:
+            pixels = np.maximum(pixels * np.float32(scale), np.float32(least))
+        node = _bitmap_node(pixels, uv, clamp=texture.clamp, nearest=not texture.interpolate)
         found = t.remember(key, mi.load_dict(node))
     return found
 
