@@ -148,9 +148,8 @@ class _FewChannelsNormAct(torch.autograd.Function):
         rows = x.permute(0, 2, 3, 1).reshape(-1, per_row * channels).to(weight.dtype, copy=True)
         rows -= (_sums(rows, channels) / pixels).repeat(per_row)
         scale = torch.rsqrt(_sums(rows.square(), channels) / pixels + NORM_EPSILON)
-        rows *= scale.repeat(per_row)
-        y = torch.addcmul(bias.repeat(per_row), rows, weight.repeat(per_row))
-        y = F.leaky_relu_(y, LEAKY_SLOPE).to(x.dtype)
+        y = torch.addcmul(bias.repeat(per_row), rows, (weight * scale).repeat(per_row)).to(x.dtype)
+        F.leaky_relu_(y, LEAKY_SLOPE)
         ctx.save_for_backward(rows, weight, scale, y)
         return y.view(ctx.shape).permute(0, 3, 1, 2)
 
@@ -159,14 +158,14 @@ class _FewChannelsNormAct(torch.autograd.Function):
         """Return the gradients of what came in."""
         rows, weight, scale, y = ctx.saved_tensors
         channels = len(weight)
-        share = channels / rows.numel()
         dy = grad.permute(0, 2, 3, 1).reshape(rows.shape)
         dy = torch.ops.aten.leaky_relu_backward(dy, y, LEAKY_SLOPE, True).to(rows.dtype)
-        grad_bias, grad_weight = _sums(dy, channels), _sums(dy * rows, channels)
-        dy.addcmul_(rows, (-share * grad_weight).repeat(ctx.per_row))
-        dy -= (share * grad_bias).repeat(ctx.per_row)
-        dy *= (weight * scale).repeat(ctx.per_row)
-        return dy.to(grad.dtype).view(ctx.shape).permute(0, 3, 1, 2), grad_weight, grad_bias
+        grad_bias, grad_weight = _sums(dy, channels), _sums(dy * rows, channels) * scale
+        factor = weight * scale
+        share = factor * channels / rows.numel()
+        dx = torch.addcmul((-share * grad_bias).repeat(ctx.per_row), dy, factor.repeat(ctx.per_row))
+        dx.addcmul_(rows, (-share * scale * grad_weight).repeat(ctx.per_row))
+        return dx.to(grad.dtype).view(ctx.shape).permute(0, 3, 1, 2), grad_weight, grad_bias
 
 
 def _sums(rows: Tensor, channels: int) -> Tensor:
