@@ -26,7 +26,6 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
-from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.report.preview import side_by_side
@@ -317,8 +316,6 @@ def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Pr
     wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}
     if options.dip_denoise:
         wanted |= set(decision_of(scene).buffers)
-    quantities = [name for name in CHANNELS if name in wanted]
-    check_fits_mitsuba(scene, quantities)
     return render(
         scene,
         spp=options.spp,
@@ -326,7 +323,7 @@ def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Pr
         threads=options.threads,
         timeout_s=(_timeout_of(scene) if options.timeout is None else options.timeout) or None,
         progress=progress,
-        quantities=quantities,
+        quantities=[name for name in CHANNELS if name in wanted],
     )
 
 

@@ -9,7 +9,6 @@ from typing import Literal, get_args
 
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
@@ -41,7 +40,6 @@ def render(
     if host not in get_args(Host):
         raise InputError(f"host: expected one of {', '.join(get_args(Host))}, got {host}")
     from tungsten_dip.hosts import tungsten
-    from tungsten_dip.hosts.mitsuba.render import QUANTITIES
     from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 
     if host == "auto":
@@ -56,5 +54,4 @@ def render(
             )
         if not isinstance(scene, Scene):
             scene = load_scene(scene)
-        check_fits_mitsuba(scene, QUANTITIES)
         return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)

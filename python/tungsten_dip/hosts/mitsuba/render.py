@@ -18,6 +18,7 @@ import numpy as np
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.progress import Progress, silent
@@ -55,13 +56,14 @@ def render(
     A and B by turns and are independent, so the halves are; with 1 spp there are neither halves nor a
     variance. After ``timeout_s`` seconds the render ends at the next step of the scene's ``spp_step``.
 
-    Raises InputError if Mitsuba is missing or cannot show what the scene calls for, or an argument is out of
-    range, and KeyboardInterrupt within a moment of Ctrl-C.
+    Raises InputError if Mitsuba is missing or cannot show what the scene calls for, the picture would not fit
+    into memory, or an argument is out of range, and KeyboardInterrupt within a moment of Ctrl-C.
     """
     if scene.renderer.adaptive_sampling or scene.renderer.stratified_sampler:
         _log.info(
             "adaptive_sampling and stratified_sampler rest: every pixel gets as many independent samples"
         )
+    check_fits_mitsuba(scene, quantities)
     with mitsuba_variant():
         from tungsten_dip.hosts.mitsuba.translate import translate
 
