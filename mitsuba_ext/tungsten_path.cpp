@@ -37,7 +37,6 @@
 #include <mitsuba/render/sensor.h>
 #include <mitsuba/render/shape.h>
 #include <mitsuba/render/texture.h>
-#include <nanothread/nanothread.h>
 
 #include <algorithm>
 #include <array>
@@ -54,6 +53,7 @@
 #include <string_view>
 #include <vector>
 
+#include "core.hpp"
 #include "tungsten_lens.hpp"
 #include "tungsten_plugin.hpp"
 
@@ -316,24 +316,18 @@ class TungstenPath final : public Variant::Integrator {
         const uint32_t tiles = tiles_x * ((size.y() + tile_size - 1) / tile_size);
         std::atomic<uint32_t> tiles_done = 0;
         std::atomic_ref(progress_).store(0.f);
-        const std::unique_ptr<Pool, void (*)(Pool*)> pool(pool_create(threads_), pool_destroy);
-        dr::parallel_for(
-            dr::blocked_range<uint32_t>(0, tiles, 1),
-            [&](const dr::blocked_range<uint32_t>& range) {
-                for (const uint32_t tile : range) {
-                    const uint32_t x0 = tile % tiles_x * tile_size;
-                    const uint32_t y0 = tile / tiles_x * tile_size;
-                    for (uint32_t y = y0; y < std::min(y0 + tile_size, size.y()); ++y)
-                        for (uint32_t x = x0; x < std::min(x0 + tile_size, size.x()); ++x) {
-                            const uint32_t pixel = y * size.x() + x;
-                            render_pixel(*scene, *sensor, {x, y}, size, {seed, pixel}, spp,
-                                         &image[pixel * channels]);
-                        }
-                    std::atomic_ref(progress_).store(static_cast<float>(++tiles_done) /
-                                                     static_cast<float>(tiles));
+        // Not by drjit's pool of threads, whose destruction now and then waits for ever.
+        tungsten_dip::parallel_for(static_cast<int>(tiles), static_cast<int>(threads_), [&](int index) {
+            const auto tile = static_cast<uint32_t>(index);
+            const uint32_t x0 = tile % tiles_x * tile_size;
+            const uint32_t y0 = tile / tiles_x * tile_size;
+            for (uint32_t y = y0; y < std::min(y0 + tile_size, size.y()); ++y)
+                for (uint32_t x = x0; x < std::min(x0 + tile_size, size.x()); ++x) {
+                    const uint32_t pixel = y * size.x() + x;
+                    render_pixel(*scene, *sensor, {x, y}, size, {seed, pixel}, spp, &image[pixel * channels]);
                 }
-            },
-            pool.get());
+            std::atomic_ref(progress_).store(static_cast<float>(++tiles_done) / static_cast<float>(tiles));
+        });
         const std::array<size_t, 3> shape{size.y(), size.x(), channels};
         return {image.data(), shape.size(), shape.data()};
     }
