@@ -117,9 +117,10 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
         if not part.any():
             continue
         triangles = mesh.triangles[part]
-        if emission and normals is not None:
-            emission["emitter"]["faces"] = _triangles(t, {}, positions, triangles, mesh.uvs)
         node = {**_surroundings(t, primitive, bsdf), **emission}
+        if emission and normals is not None:
+            faces = _triangles(t, {}, positions, triangles, mesh.uvs)
+            node["emitter"] = {**emission["emitter"], "faces": faces}
         shapes.append(_triangles(t, node, positions, triangles, mesh.uvs, normals))
     return shapes
 

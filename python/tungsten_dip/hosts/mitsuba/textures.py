@@ -151,9 +151,8 @@ def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> npt.NDArra
 
 def _requested(value: Vec3, request: Request, scale: float, least: float) -> Vec3 | float:
     r, g, b = (max(component * scale, least) for component in value)
-    return (
-        (r, g, b) if request == "rgb" else r
-    )  # Tungsten takes the first component of a constant, not the mean
+    # A number is the first component of a constant in Tungsten, not the mean.
+    return (r, g, b) if request == "rgb" else r
 
 
 def _bitmap_object(
