@@ -27,6 +27,9 @@ class Area final : public Emitter<Float, Spectrum> {
         : Base(props), radiance_(props.get_unbounded_texture<Texture>("radiance")) {
         for (const auto& prop : props.objects())
             if (auto* shape = prop.try_get<Shape>()) faces_ = shape;
+        // Mitsuba makes a mesh's table of areas when it is first asked for, which threads must not do at
+        // once.
+        if (faces_) faces_->surface_area();
         m_flags = +EmitterFlags::Surface;
     }
 

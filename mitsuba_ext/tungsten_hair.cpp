@@ -8,7 +8,6 @@
 //   sigma_a        rgb: absorption per radius of the strand
 //   faces_viewer   boolean: the azimuth is counted from the viewer, and not from the normal of the curve
 #include <array>
-#include <memory>
 #include <numbers>
 #include <vector>
 

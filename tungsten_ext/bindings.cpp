@@ -65,6 +65,7 @@ void bind(const py::module_& module) {
     module.doc() = "Tungsten itself: renders a scene and hands over its camera's buffers.";
     module.attr("tungsten_version") = tungsten_version();
 
+    py::register_exception<PictureTooLarge>(module, "PictureTooLarge");
     py::class_<RenderPlan>(module, "RenderPlan", "What the scene file and the overrides come to.")
         .def_readonly("integrator", &RenderPlan::integrator)
         .def_readonly("tonemap", &RenderPlan::tonemap)
@@ -96,7 +97,7 @@ void bind(const py::module_& module) {
              py::arg("spp") = py::none(), py::arg("seed") = py::none(), py::arg("input_directory") = "",
              py::arg("output_directory") = "", py::arg("output_file") = "", py::arg("hdr_output_file") = "",
              py::call_guard<py::gil_scoped_release>(),
-             "Load a scene. Raises RuntimeError, in one line, where Tungsten cannot, and ValueError, "
+             "Load a scene. Raises RuntimeError, in one line, where Tungsten cannot, and PictureTooLarge, "
              "which says the size, for more than max_pixels.")
         .def_property_readonly("plan", &Render::plan, py::return_value_policy::copy)
         .def_property_readonly("current_spp", &Render::current_spp)

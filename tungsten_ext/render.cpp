@@ -184,7 +184,7 @@ Render::Render(const std::string& scene_path, const RenderOptions& options) : im
     }
     const Vec2u size = self.scene->camera()->resolution();
     if (options.max_pixels && std::uint64_t{size.x()} * size.y() > *options.max_pixels)
-        throw std::length_error(std::to_string(size.x()) + " x " + std::to_string(size.y()));
+        throw PictureTooLarge(std::to_string(size.x()) + " x " + std::to_string(size.y()));
 
     RendererSettings& settings = self.scene->rendererSettings();
     if (options.spp) settings.setSpp(*options.spp);

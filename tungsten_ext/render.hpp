@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <memory>
 #include <optional>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -61,10 +62,14 @@ struct RenderPlan {
     std::uint32_t seed;
 };
 
+struct PictureTooLarge : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
 // A loaded scene that asks for the evidence a fit needs: independent sampler, halves and variance of every
 // quantity the integrator writes. The scene's own buffer files are still written as the scene asks. One at a
 // time per process. Every method throws std::runtime_error (or what Tungsten throws) with a message in words;
-// the constructor std::length_error with the size of an image of more than `max_pixels`.
+// the constructor PictureTooLarge with the size of an image of more than `max_pixels`.
 class Render {
   public:
     Render(const std::string& scene, const RenderOptions& options);

@@ -93,7 +93,7 @@ def regress(
     """
 
 def structure_tensor(features: FloatImage, threads: int = 0) -> FloatImage:
-    """Return the products xx, yy, xy of the gradients of ``features``, summed and smoothed."""
+    """Return the products xx, yy, xy of the features' gradients, summed, smoothed: (height, width, 3)."""
 
 def smooth_along_edges(
     image: FloatImage, tensor: FloatImage, *, along: float, across: float, threads: int = 0

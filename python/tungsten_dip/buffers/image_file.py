@@ -84,7 +84,9 @@ def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> 
             OpenEXR.File(encoded).write(stream)
         except (RuntimeError, ValueError) as error:
             reason = _one_line(str(error))
-            raise InputError(f"{path}: cannot be written ({reason}); leave out what does not fit") from error
+            raise InputError(
+                f"{path}: OpenEXR cannot write this ({reason}); leave layers out of the input"
+            ) from error
 
 
 @contextmanager

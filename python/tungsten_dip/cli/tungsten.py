@@ -270,7 +270,7 @@ def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoi
     def denoise(camera: Camera, buffers: RenderBuffers) -> FitResult:
         known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
         if known is None:
-            log.info("frames of this camera cannot be moved into place, and do not help one another")
+            log.info("a camera of type %s moves no frame into place", camera.kind)
         with progress_on_stderr("denoising") as progress:
             return follower.denoise(buffers, known, progress).result
 

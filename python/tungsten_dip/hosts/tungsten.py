@@ -274,7 +274,7 @@ def _load(scene: Path, options: DriverOptions) -> Any:
             seed=options.seed,
             **paths,
         )
-    except ValueError as size:
+    except module.PictureTooLarge as size:
         raise too_large(scene, str(size), max_pixels) from None
     except RuntimeError as error:
         raise InputError(

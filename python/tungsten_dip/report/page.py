@@ -18,7 +18,7 @@ from tungsten_dip.scene.tonemap import display_from_radiance
 
 _CURVE_HEIGHT = 260
 _SKY_DEPTH = 1e9
-"""The same as in `buffers.sanitize`."""
+"""What `buffers.sanitize` takes for infinite (cpp/sanitize.cpp)."""
 
 
 def report_page(

@@ -194,7 +194,7 @@ def _summed_at_equal_places(
             "merge them or set recompute_normals to false"
         )
     pairs_before = np.cumsum(vertices_there) - vertices_there
-    sums = np.zeros_like(positions)
+    sums = np.zeros((3, len(positions)))
     steps = np.arange(_NORMAL_PAIRS_AT_ONCE, total, _NORMAL_PAIRS_AT_ONCE)
     for part in np.split(np.arange(len(corners)), np.searchsorted(pairs_before, steps)):
         pair_corner = np.repeat(part, vertices_there[part])
@@ -203,9 +203,8 @@ def _summed_at_equal_places(
         pair_face = face[pair_corner]
         smooth = np.einsum("ij,ij->i", reference[pair_vertex], unit[pair_face]) >= SPLIT_COSINE
         for axis in range(3):
-            values = weighted[pair_face[smooth], axis]
-            sums[:, axis] += np.bincount(pair_vertex[smooth], values, minlength=len(positions))
-    return sums
+            np.add.at(sums[axis], pair_vertex[smooth], weighted[pair_face[smooth], axis])
+    return sums.T
 
 
 def _bytes_of(path: Path) -> bytes:

@@ -123,7 +123,9 @@ class Follower:
     def _tell_what_is_missing(self, buffers: RenderBuffers) -> None:
         if buffers.depth is None and not self._told:
             self._told = True
-            _LOG.warning("no depth: frames cannot be moved by their cameras, and do not help one another")
+            _LOG.warning(
+                "no depth: frames cannot be moved by their cameras; they start from the first's network"
+            )
 
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
         alone = buffers.with_quantities(normal=None, depth=None)
