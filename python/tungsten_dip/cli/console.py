@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import logging
 import math
@@ -71,9 +70,6 @@ def run(command: str, body: Callable[[], None]) -> int:
     """Run a command's body and return its exit status; whatever goes wrong becomes one line on stderr."""
     debug = bool(os.environ.get(DEBUG_VARIABLE))
     _replace_closed_streams()
-    for stream in (sys.stdout, sys.stderr):  # names of files need not be UTF-8
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     try:
         with _log_on_stderr(command):
             body()

@@ -91,7 +91,7 @@ class Follower:
         self._refit = refit
         self._last: _Last | None = None
         self._error: float | None = None
-        self._told = False
+        self._told_of_depth = False
 
     def denoise(
         self, buffers: RenderBuffers, camera: Camera | None = None, progress: Progress = silent
@@ -121,8 +121,8 @@ class Follower:
         return replace(followed, result=with_notes(result, known.notes))
 
     def _tell_what_is_missing(self, buffers: RenderBuffers) -> None:
-        if buffers.depth is None and not self._told:
-            self._told = True
+        if buffers.depth is None and not self._told_of_depth:
+            self._told_of_depth = True
             _LOG.warning(
                 "no depth: frames cannot be moved by their cameras; they start from the first's network"
             )
