@@ -6,7 +6,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -672,23 +672,57 @@ def test_batches_show_all_that_is_trained_on_and_nothing_else(
     assert seen == {*trained, *(pixels + trained)}
 
 
-@pytest.mark.parametrize("spoil", ["sums", "another picture"])
-def test_halves_of_another_picture_are_left_aside(spoil: str, render: SyntheticRender) -> None:
+@pytest.mark.parametrize("spoil", ["sums", "another picture", "little of another layer"])
+@pytest.mark.parametrize("black", [0.0, 0.8])
+def test_halves_of_another_picture_are_left_aside(spoil: str, black: float, render: SyntheticRender) -> None:
     color = render.buffers.color
     assert color.half_a is not None
     assert color.half_b is not None
-    halves = {
-        "sums": (color.half_a / 2, color.half_b / 2),
-        "another picture": (
-            np.ascontiguousarray(color.half_a[::-1]),
-            np.ascontiguousarray(color.half_b[::-1]),
-        ),
-    }[spoil]
-    buffers = render.buffers.with_quantities(color=Buffer(color.mean, *halves, color.variance))
+    mean, a, b = color.mean.copy(), color.half_a.copy(), color.half_b.copy()
+    for image in (mean, a, b):
+        image[: round(black * len(image))] = 0
+    if spoil == "sums":
+        a, b = a / 2, b / 2
+    elif spoil == "another picture":
+        a, b = (np.ascontiguousarray(half[:, ::-1]) for half in (a, b))
+    else:
+        mean[:, : mean.shape[1] // 8] = 0
+    buffers = render.buffers.with_quantities(color=Buffer(mean, a, b, color.variance))
     result = denoise(buffers, _settings())
     _check(result, buffers)
-    assert any("another picture" in note for note in result.notes)
-    assert result.color.mean() == pytest.approx(color.mean.mean(), rel=0.05)
+    assert any("color: the half buffers are those of another picture" in note for note in result.notes)
+    assert result.color.mean() == pytest.approx(mean.mean(), rel=0.05)
+
+
+def test_halves_of_another_feature_are_left_aside(render: SyntheticRender) -> None:
+    normal = render.buffers.normal
+    assert normal is not None
+    assert normal.halves is not None
+    flipped = (np.ascontiguousarray(half[:, ::-1]) for half in normal.halves)
+    mixed = render.buffers.with_quantities(normal=Buffer(normal.mean, *flipped, normal.variance))
+    alone = render.buffers.with_quantities(normal=Buffer(normal.mean, variance=normal.variance))
+    result = denoise(mixed, _settings())
+    assert any("normal: the half buffers are those of another picture" in note for note in result.notes)
+    np.testing.assert_array_equal(result.color, denoise(alone, _settings()).color)
+
+
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_no_light_where_nothing_is_covered(
+    preset: Literal["draft", "paper"], render: SyntheticRender
+) -> None:
+    """Features are left out: alpha alone tells that there is nothing."""
+    color = render.buffers.color
+    rows, columns = np.indices(color.mean.shape[:2])
+    covered = (rows - 20) ** 2 + (columns - 20) ** 2 < 150
+    glow = (rows > 40) & (columns > 40)
+    alpha = covered[:, :, None].astype(np.float32)
+    light = (covered | glow)[:, :, None]
+    planes = {name: np.where(light, plane, np.float32(0)) for name, plane in color.planes()}
+    buffers = RenderBuffers(Buffer(**planes), alpha=alpha)
+    settings = _settings() if preset == "draft" else FitSettings("paper", iterations=2, inputs="random")
+    result = denoise(buffers, settings).color
+    assert (result[~(covered | glow)] == 0).all()
+    assert (result[glow] > 0).all()
 
 
 def test_halves_of_unequal_size_are_used(render: SyntheticRender) -> None:

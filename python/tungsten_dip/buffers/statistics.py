@@ -1,13 +1,26 @@
-"""Whether the noise of a render's halves is independent."""
+"""Whether half buffers are what they are called: halves of the image's samples, with independent noise."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-__all__ = ["HalvesTest", "halves_independent"]
+__all__ = ["HalvesTest", "halves_independent", "without_foreign_halves"]
+
+_UNEQUAL = 0.5
+"""How far a pixel may lie from (A + B) / 2, in units of |A - B| / 2: of one and two samples it is 1/3."""
+
+_ROUNDED = 2e-3
+"""Relative difference that rounding to 16 bits explains."""
+
+_FOREIGN_SHARE = 0.05
+"""Part of the pixels that may lie further away. In renders it is 0 to 0.01, where values were repaired."""
+
+_ENOUGH_PIXELS = 1 << 16
 
 
 def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
@@ -22,3 +35,38 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     if color.halves is None:
         return HalvesTest()
     return _core.compare_halves(*color.halves, color.variance, thread_count(threads))
+
+
+def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return buffers without those halves whose mean is not the image, and a line for each quantity.
+
+    Such halves were left by another render, or belong to another layer (two light groups named A and B, say).
+    Expects sanitised buffers.
+    """
+    foreign = [name for name, buffer in buffers.quantities() if not _halves_belong(buffer)]
+    alone: dict[str, Buffer | None] = {}
+    for name in foreign:
+        buffer: Buffer = getattr(buffers, name)
+        alone[name] = Buffer(buffer.mean, variance=buffer.variance)
+    lines = tuple(
+        f"{name}: the half buffers are those of another picture (their mean is not the image), not used"
+        for name in foreign
+    )
+    return buffers.with_quantities(**alone), lines
+
+
+def _halves_belong(buffer: Buffer) -> bool:
+    """Whether nearly every pixel is the mean of its halves, but for rounding and halves of unequal size.
+
+    Pixels that are 0 in all three say nothing, and most of an image may be so.
+    """
+    if buffer.halves is None:
+        return True
+    step = -(-buffer.mean[:, :, 0].size // _ENOUGH_PIXELS)
+    mean, a, b = (
+        image.reshape(-1, image.shape[2])[::step].astype(np.float64)
+        for image in (buffer.mean, *buffer.halves)
+    )
+    apart, noise, level = (abs(image).sum(axis=1) for image in ((a + b) / 2 - mean, (a - b) / 2, mean))
+    foreign = np.count_nonzero(apart > _UNEQUAL * noise + _ROUNDED * level)
+    return bool(foreign <= _FOREIGN_SHARE * np.count_nonzero(apart + noise + level))

@@ -10,7 +10,7 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.oidn import require_oidn
-from tungsten_dip.fit.preparation import prepared, with_notes
+from tungsten_dip.fit.preparation import finished, prepared
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
@@ -96,4 +96,4 @@ def denoise(
             from tungsten_dip.fit.fusion import fit_fusion
 
         result = fit_fusion(known.buffers, settings, progress, known.candidates, warm_start, known.previous)
-    return with_notes(result, known.notes)
+    return finished(result, known)

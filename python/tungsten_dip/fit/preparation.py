@@ -1,4 +1,4 @@
-"""What every way to denoise an image does with its input first, and with its notes at the end."""
+"""What every way to denoise an image does with its input first, and with its result at the end."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.buffers.statistics import without_foreign_halves
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.settings import FitResult
@@ -46,12 +47,21 @@ def prepared(
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, mended = sanitize(buffers, threads)
-    return Prepared(buffers, given, previous, mended)
+    buffers, foreign = without_foreign_halves(buffers)
+    return Prepared(buffers, given, previous, (*mended, *foreign))
 
 
-def with_notes(result: FitResult, notes: Sequence[str]) -> FitResult:
-    """Return the result with ``notes`` before its own, all of which are logged."""
-    result = replace(result, notes=(*notes, *result.notes))
+def finished(result: FitResult, known: Prepared) -> FitResult:
+    """Return the result with the notes on its input before its own, all of which are logged.
+
+    Where alpha and colour of the input are 0 the result is black: light without coverage would glow around
+    whatever the picture is laid over.
+    """
+    result = replace(result, notes=(*known.notes, *result.notes))
     for note in result.notes:
         _LOG.info(note)
-    return result
+    alpha = known.buffers.alpha
+    if alpha is None:
+        return result
+    empty = (alpha <= 0) & (known.buffers.color.mean == 0).all(axis=2, keepdims=True)
+    return replace(result, color=np.where(empty, np.float32(0), result.color))

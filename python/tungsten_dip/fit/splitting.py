@@ -42,15 +42,6 @@ _LEAST_SHAPE_OF_LAMPS = 8.0
 _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
 
-_UNEQUAL = 0.5
-"""How far the mean may lie from (A + B) / 2, in units of |A - B| / 2: of one and two samples it is 1/3."""
-
-_ROUNDED = 2e-3
-"""Relative difference that rounding to 16 bits explains."""
-
-_ENOUGH_PIXELS = 1 << 14
-"""Of an image, for the medians that tell whether halves belong to it."""
-
 
 def with_independent_halves(
     buffers: RenderBuffers, candidates: tuple[Halves, ...], seed: int, threads: int | None
@@ -65,7 +56,7 @@ def with_independent_halves(
     test = halves_independent(buffers, threads)
     # Of tiny or plain images nothing tells, and halves are what they are called unless they are copies.
     untold = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
-    if (test.independent or untold) and _belong(color):
+    if test.independent or untold:
         return buffers, candidates, ()
     emitted = np.zeros_like(color.mean)
     if buffers.albedo is not None:
@@ -113,22 +104,9 @@ def _sum_of_squares(image: FloatImage) -> _Plane:
     return squares
 
 
-def _belong(color: Buffer) -> bool:
-    """Whether the colour is the mean of its halves, but for rounding and for halves of unequal size."""
-    step = -(-color.mean[:, :, 0].size // _ENOUGH_PIXELS)
-    mean, a, b = (
-        image.reshape(-1, 3)[::step].astype(np.float64) for image in (color.mean, *color.halves_or_mean)
-    )
-    apart = np.median(abs((a + b) / 2 - mean))
-    noise, level = np.median(abs(a - b) / 2), np.median(abs(mean))
-    return bool(apart <= _UNEQUAL * noise + _ROUNDED * level)
-
-
 def _why(buffers: RenderBuffers, test: HalvesTest) -> str:
     if buffers.color.halves is None:
         return "the image has no half buffers"
     if np.isnan(test.correlation) and np.array_equal(*buffers.color.halves):
         return "the image's half buffers are copies"
-    if test.independent or np.isnan(test.correlation):
-        return "the half buffers are those of another picture than the image"
     return f"the image's half buffers are not independent (correlation {test.correlation:.2f})"

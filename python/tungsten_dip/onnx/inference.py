@@ -18,7 +18,7 @@ from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_l
 from tungsten_dip.fit.model import Model, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
-from tungsten_dip.fit.preparation import prepared, with_notes
+from tungsten_dip.fit.preparation import finished, prepared
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -65,7 +65,7 @@ def infer(
         if refit_steps or known.candidates or known.previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
         result = _infer_paper(model, known.buffers, settings, progress)
-    return with_notes(result, known.notes)
+    return finished(result, known)
 
 
 def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:
