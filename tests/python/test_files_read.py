@@ -229,6 +229,14 @@ def test_what_was_taken_for_what_is_logged(tmp_path: Path, caplog: pytest.LogCap
     assert "ignored: id, P" in lines
 
 
+def test_luminance_and_chroma_are_not_taken_for_a_grey_picture(tmp_path: Path) -> None:
+    save(tmp_path / "a.exr", "Y", "RY", "BY")
+    with pytest.raises(InputError, match="luminance and chroma"):
+        read_buffers(tmp_path / "a.exr")
+    save(tmp_path / "b.exr", "Y")
+    assert np.ptp(read_buffers(tmp_path / "b.exr").color.mean, axis=2).max() == 0
+
+
 def test_map_settles_the_rest(tmp_path: Path) -> None:
     channels = save(
         tmp_path / "a.exr", *rgb("main"), *rgb("odd"), "nx", "ny", "nz", "dist", *rgb("albedo"), "m"
@@ -365,6 +373,8 @@ def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest
             read_buffers(tmp_path).color, save(tmp_path / "color.exr", *"RGB", dtype=np.float16), *"RGB"
         )
     assert "ignored: beauty.exr, color.pfm" in caplog.text
+    with pytest.raises(InputError, match="no mean that this belongs to"):
+        read_buffers(tmp_path, {"albedo": "none", "albedoA": "albedoA"})
     mapped = read_buffers(tmp_path, {"color": "beauty", "normal": "none", "albedo": "normal.exr"})
     assert holds(mapped.color, channels, *"RGB")
     assert mapped.normal is None

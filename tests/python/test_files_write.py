@@ -204,6 +204,38 @@ def test_parts_pass_through(tmp_path: Path) -> None:
         write_denoised(tmp_path / "out.exr", result_for(again, error=True), again)
 
 
+def test_no_channel_of_the_noisy_picture_stays_beside_the_denoised_one(tmp_path: Path) -> None:
+    for names in ("rgba", "Y", "RGBA"):
+        save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})
+        buffers = read_buffers(tmp_path / "in.exr")
+        write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+        [(_, written, _)] = load(tmp_path / "out.exr")
+        top = {name for name in written if "." not in name}
+        assert top == ({*"RGB"} if names == "Y" else {*"RGBA"})
+        assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+
+
+def test_what_was_changed_since_is_written_as_it_is_now(tmp_path: Path) -> None:
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate("RGBZ")}})
+    buffers = read_buffers(tmp_path / "in.exr")
+    changed = buffers.with_quantities(color=Buffer(2 * buffers.color.mean), depth=None)
+    write_denoised(tmp_path / "out.exr", result_for(changed), changed)
+    again = read_buffers(tmp_path / "out.exr")
+    assert same_bits(again.color.mean, 2 * buffers.color.mean)
+    assert again.depth is None
+
+
+def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) -> None:
+    for name, size in (("in", (3, 2)), ("other", (3, 3))):
+        save(tmp_path / f"{name}.exr", {"": {channel: noise(size) for channel in "RGB"}})
+    buffers, other = (read_buffers(tmp_path / f"{name}.exr") for name in ("in", "other"))
+    with pytest.raises(InputError, match="made from"):
+        write_denoised(tmp_path / "out.exr", result_for(other), buffers)
+    with pytest.raises(InputError, match=r"ends in \.exr"):
+        write_denoised(tmp_path / "out.png", result_for(buffers), buffers)
+    assert not list(tmp_path.glob("out*"))
+
+
 def test_the_map_is_remembered(tmp_path: Path) -> None:
     names = [*"RGB", "main.R", "main.G", "main.B", "nx", "ny", "nz"]
     save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})

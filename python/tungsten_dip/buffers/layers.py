@@ -86,6 +86,10 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
             if quantity == "color":
                 color_prefix = prefix
         _add_planes(channels, quantity, layer, names, layers, mapping)
+    if {"Y", "RY", "BY"} <= {name.upper() for name in channels.get("color", ())} | layers.keys():
+        raise InputError(
+            "the colour is luminance and chroma (Y, RY, BY): expected R, G, B; convert the image"
+        )
     if "color" not in channels:
         found = ", ".join(layers) or "nothing"
         raise InputError(f"no colour: expected R, G, B or layer color, found {found}; use --map color=LAYER")

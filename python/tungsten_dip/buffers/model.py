@@ -71,7 +71,8 @@ class RenderBuffers:
 
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies.
     ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
-    output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose.
+    output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
+    (None for buffers that are not those of a file).
 
     Raises InputError if the shapes or the channel counts do not fit together, or an array is no C-contiguous
     float32.
@@ -114,8 +115,8 @@ class RenderBuffers:
                 yield name, buffer
 
     def with_quantities(self, **buffers: Buffer | None) -> RenderBuffers:
-        """Return a copy with some quantities replaced."""
-        return replace(self, **buffers)  # type: ignore[arg-type]
+        """Return a copy with some quantities replaced, and without ``source``, which does not hold them."""
+        return replace(self, source=None, **buffers)  # type: ignore[arg-type]
 
 
 def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:

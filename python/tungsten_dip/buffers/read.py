@@ -112,6 +112,9 @@ def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path
                 files[key] = match
             elif key in mapping:
                 raise InputError(f"--map {key}={wanted}: not in {folder}; there are {_names(present)}")
+    for key, wanted in mapping.items():
+        if wanted != NOTHING and key not in files:
+            raise InputError(f"--map {key}={wanted}: there is no mean that this belongs to; map that too")
     if "color" not in files:
         raise InputError(
             f"{folder}: expected color.exr (.pfm, .hdr), found {_names(present)}; "

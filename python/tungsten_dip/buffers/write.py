@@ -4,8 +4,9 @@ A denoised EXR holds, in one file:
 
 - R, G, B (and A) at the top level: the denoised picture, float32 or half;
 - layer ``error``: the estimated squared relative error of every pixel, where known;
-- every channel of the input bit for bit, in its own pixel type. Input channels whose names are taken move to
-  the layer ``noisy``; the parts of a multi-part input follow the part with the picture as they were;
+- every channel of the input bit for bit, in its own pixel type. Input channels whose names are taken (in
+  upper or lower case, and a grey picture's) move to the layer ``noisy``; the parts of a multi-part input
+  follow the part with the picture as they were;
 - attributes: those of the input, and our own, which begin with ``tungsten_dip/``.
 
 ``read_buffers`` undoes this, so that a denoised file can be denoised again.
@@ -33,6 +34,9 @@ log = logging.getLogger(__name__)
 LARGEST_HALF = 65504.0
 
 _DENOISED_PART = "tungsten_dip denoised"
+
+_GREY = ("Y",)
+"""Channels of a picture that must not stand beside another one's red, green and blue."""
 
 _COMPONENTS = {"color": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Y", "visibility": "Y"}
 
@@ -72,8 +76,17 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, h
     value beyond 65504 into infinity. Settings, seed, seconds, iterations, the estimated relMSE and the
     version become attributes.
 
-    Raises InputError if the file cannot be written; an existing file then stays as it was.
+    Raises InputError if the file is no .exr or cannot be written, or the result is of another size than the
+    buffers; an existing file then stays as it was.
     """
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise InputError(f"{path}: expected a name that ends in .exr, which holds all layers")
+    if result.color.shape != buffers.color.mean.shape:
+        raise InputError(
+            f"the result has shape {result.color.shape}, the buffers {buffers.color.mean.shape}; "
+            f"give those that it was made from"
+        )
     source = buffers.source or _source_from_buffers(buffers)
     added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", result.color, half))
     if result.error is not None:
@@ -85,7 +98,8 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, h
     moved_to = "noisy"
     while any(name.startswith(moved_to + ".") for name in kept):
         moved_to += "_"
-    kept = {f"{moved_to}.{name}" if name in added else name: channel for name, channel in kept.items()}
+    taken = {name.upper() for name in (*added, *_GREY)}
+    kept = {f"{moved_to}.{name}" if name.upper() in taken else name: plane for name, plane in kept.items()}
     own: dict[str, Any] = {
         OWN + "version": metadata.version("tungsten-dip"),
         OWN + "seed": str(result.settings.seed),
@@ -104,7 +118,7 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, h
         parts = [Part(added | kept, attributes, source.parts[0].name)]
     else:
         parts = [Part(added, attributes, _DENOISED_PART), *source.parts]
-    write_exr(Path(path), parts, result.settings.threads)
+    write_exr(path, parts, result.settings.threads)
 
 
 def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:
