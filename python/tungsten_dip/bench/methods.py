@@ -17,6 +17,7 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import require_torch
 from tungsten_dip.fit.oidn import Quality, oidn_image, require_oidn
+from tungsten_dip.fit.published import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.progress import Progress
 
@@ -80,7 +81,7 @@ class Plan:
     kinds: tuple[str, ...] = KINDS
     presets: tuple[Preset, ...] = OUR_PRESETS
     budgets_s: tuple[float, ...] = (2, 5, 10, 20)
-    paper_iterations: int = 3000
+    paper_iterations: int = ITERATIONS
     nfor_s: float | None = None
     denoiser: Path | None = None
     scenes: tuple[Path, ...] = ()

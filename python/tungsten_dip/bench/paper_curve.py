@@ -6,8 +6,9 @@ import time
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from tungsten_dip.buffers import FloatImage, RenderBuffers, sanitize
+from tungsten_dip.buffers import FloatImage, RenderBuffers
 from tungsten_dip.fit.inputs import paper_images
+from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
@@ -42,7 +43,7 @@ def paper_curve(
     looking_s = 0.0
     points = []
     total = max(checkpoints)
-    buffers, _ = sanitize(buffers, settings.threads)
+    buffers = prepared(buffers, threads=settings.threads).buffers
     with compute_device(settings) as device:
         fit = PaperFit(paper_images(buffers, settings), settings, device)
         for iteration in range(1, total + 1):
@@ -58,10 +59,6 @@ def paper_curve(
 
 
 def checkpoints_up_to(iterations: int, first: int = 100) -> tuple[int, ...]:
-    """Return 1 and 3 times the powers of ten from ``first`` on, and ``iterations``.
-
-    >>> checkpoints_up_to(3000)
-    (100, 300, 1000, 3000)
-    """
+    """Return 1 and 3 times the powers of ten from ``first`` on, and ``iterations``."""
     rounded = (digit * 10**exponent for exponent in range(len(str(iterations))) for digit in (1, 3))
     return (*(count for count in rounded if first <= count < iterations), iterations)

@@ -21,10 +21,10 @@ from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
-from tungsten_dip.buffers import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.inputs import paper_images
-from tungsten_dip.fit.paper import ITERATIONS
+from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.published import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 
@@ -162,9 +162,8 @@ def run_paper_table(
 
 
 def _can_be_fitted(bench_set: BenchSet, row: PublishedRow, settings: FitSettings) -> bool:
-    buffers, _ = sanitize(bench_set.buffers, settings.threads)
     try:
-        paper_images(buffers, settings)
+        paper_images(prepared(bench_set.buffers, threads=settings.threads).buffers, settings)
     except InputError as error:
         _LOG.warning("row %d is left out: %s", row.number, error)
         return False

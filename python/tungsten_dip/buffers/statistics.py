@@ -18,7 +18,7 @@ _ROUNDED = 2e-3
 """Relative difference that rounding to 16 bits explains."""
 
 _FOREIGN_SHARE = 0.05
-"""Part of the pixels that may lie further away. In renders it is 0 to 0.01, where values were repaired."""
+"""Part of the pixels that may lie further away. In renders it is below 0.01."""
 
 _ENOUGH_PIXELS = 1 << 16
 
@@ -41,7 +41,7 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
     """Return buffers without those halves whose mean is not the image, and a line for each quantity.
 
     Such halves were left by another render, or belong to another layer (two light groups named A and B, say).
-    Expects sanitised buffers.
+    Expects buffers as they were rendered: sanitising moves mean and halves apart, and mends one by the other.
     """
     foreign = [name for name, buffer in buffers.quantities() if not _halves_belong(buffer)]
     alone: dict[str, Buffer | None] = {}
@@ -58,7 +58,8 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
 def _halves_belong(buffer: Buffer) -> bool:
     """Whether nearly every pixel is the mean of its halves, but for rounding and halves of unequal size.
 
-    Pixels that are 0 in all three say nothing, and most of an image may be so.
+    Pixels that are 0 in all three say nothing, and most of an image may be so; nor do
+    those that are not finite.
     """
     if buffer.halves is None:
         return True
@@ -67,6 +68,8 @@ def _halves_belong(buffer: Buffer) -> bool:
         image.reshape(-1, image.shape[2])[::step].astype(np.float64)
         for image in (buffer.mean, *buffer.halves)
     )
-    apart, noise, level = (abs(image).sum(axis=1) for image in ((a + b) / 2 - mean, (a - b) / 2, mean))
-    foreign = np.count_nonzero(apart > _UNEQUAL * noise + _ROUNDED * level)
-    return bool(foreign <= _FOREIGN_SHARE * np.count_nonzero(apart + noise + level))
+    with np.errstate(invalid="ignore"):
+        apart, noise, level = (abs(image).sum(axis=1) for image in ((a + b) / 2 - mean, (a - b) / 2, mean))
+    telling = np.isfinite(apart + noise + level) & (apart + noise + level > 0)
+    foreign = telling & (apart > _UNEQUAL * noise + _ROUNDED * level)
+    return bool(np.count_nonzero(foreign) <= _FOREIGN_SHARE * np.count_nonzero(telling))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.cli.console import add_json, add_threads, duration, integers, progress_on_stderr
+from tungsten_dip.fit.published import ITERATIONS
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -34,7 +35,7 @@ def add_bench(commands: _SubParsersAction[Any]) -> None:
     add(
         "--budgets", metavar="S,S,...", type=_durations, help="time budgets of final (default: 2s,5s,10s,20s)"
     )
-    add("--paper-iterations", metavar="N", type=int, help="of the published method (default: 3000)")
+    add("--paper-iterations", metavar="N", type=int, help=f"of the published method (default: {ITERATIONS})")
     add("--nfor-seconds", metavar="S", type=duration, help="what the nfor.exr beside the buffers took")
     add("--denoiser", metavar="PATH", type=Path, help="Tungsten's command denoiser, to measure NFOR with")
     add(
@@ -51,7 +52,13 @@ def add_bench(commands: _SubParsersAction[Any]) -> None:
     paper.set_defaults(action=_paper)
     add = paper.add_argument
     _add_common(paper, "bench-paper", one=True)
-    add("--iterations", metavar="N", type=int, default=3000, help="of every row (default: 3000)")
+    add(
+        "--iterations",
+        metavar="N",
+        type=int,
+        default=ITERATIONS,
+        help=f"of every row (default: {ITERATIONS})",
+    )
     add("--rows", metavar="N,N,...", type=integers, help="only these rows, from 1 to 13, and no figure")
     add("--crop", action="store_true", help="take the middle, in multiples of 32 pixels, as published")
     add("--published", metavar="SCENE", help="the published scene: cornell-box (default), car2 or lamp")

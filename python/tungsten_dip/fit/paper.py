@@ -20,11 +20,11 @@ from tungsten_dip.fit.device import compute_device, convolution_dtype
 from tungsten_dip.fit.inputs import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
 from tungsten_dip.fit.networks import ResNet, Skip
+from tungsten_dip.fit.published import ITERATIONS
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress, silent
 
 # The numbers of the published notebook.
-ITERATIONS = 3000
 LEARNING_RATE = 1e-3
 LOW_LOSS = 5e-4
 LOW_LOSS_LEARNING_RATE = 1e-4

@@ -46,9 +46,9 @@ def prepared(
         )
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
-    buffers, mended = sanitize(buffers, threads)
     buffers, foreign = without_foreign_halves(buffers)
-    return Prepared(buffers, given, previous, (*mended, *foreign))
+    buffers, mended = sanitize(buffers, threads)
+    return Prepared(buffers, given, previous, (*foreign, *mended))
 
 
 def finished(result: FitResult, known: Prepared) -> FitResult:

@@ -1,7 +1,10 @@
-"""Numbers of the published networks, which torch (`networks`) and the exported graphs (`onnx.graph`) share.
+"""Numbers of the published method that are asked for where torch is not: by graphs, commands and tables.
 
-From the published code; ``docs/method.md`` states the networks whole.
+From the published code; ``docs/method.md`` states the method whole.
 """
+
+ITERATIONS = 3000
+"""Of a fit."""
 
 LEAKY_SLOPE = 0.2
 """Slope of the leaky ReLU below zero."""
