@@ -374,13 +374,13 @@ def _depth_of_sky(value: float) -> Callable[[FloatImage, Damaged], FloatImage]:
 
 
 _NO_EDGES = {
-    "mean": "edges that no feature shows are found in the noisy colour itself, which darkens small images"
+    "mean": "edges that no feature contains are detected in the noisy colour, which darkens small images"
 }
-_BEYOND = {"exposure": "exposures are undone up to 2^100"}
-_EMITTED = {"exposure": "albedo above 1 is light that a surface emits, in the renderer's units"}
+_BEYOND = {"exposure": "exposures are compensated up to a factor of 2^100"}
+_EMITTED = {"exposure": "albedo above 1 is emission, in the renderer's units"}
 _BOUNDED = {
-    "mean": "a wild albedo is bounded by the noisy colour, which is then all that the pilots know; choosing "
-    "among them darkens small images (this one by 1.1%, 144x96 pixels by 0.4%)"
+    "mean": "an implausible albedo is bounded by the noisy colour, which is then the only information of the "
+    "pilots; choosing among them darkens small images (this one by 1.1%, 144x96 pixels by 0.4%)"
 }
 
 
@@ -397,7 +397,9 @@ def _cases() -> Iterator[HardCase]:
             for extent, pixels in extents.items():
                 name = f"{shown} in {where}, {extent}"
                 known = _NO_EDGES if (where, pixels) == ("features", _all) else {}
-                yield HardCase("No numbers", name, lambda v=value, w=where, p=pixels: _values(v, w, p), known)
+                yield HardCase(
+                    "NaN and infinity", name, lambda v=value, w=where, p=pixels: _values(v, w, p), known
+                )
 
     group = "Radiance"
     yield HardCase(group, "half-float overflow", _half_floats)

@@ -17,7 +17,7 @@ def write_measured(path: Path, measured: list[Measured], others: list[Row]) -> N
 
 
 def _tables(measured: list[Measured], others: list[Row]) -> str:
-    parts = [] if all(m.held for m in measured) else ["In bold: a promise that is not kept yet.\n"]
+    parts = [] if all(m.held for m in measured) else ["In bold: a promise that is not yet kept.\n"]
     for group in dict.fromkeys(m.case.group for m in measured):
         of_group = [m for m in measured if m.case.group == group]
         lines = [f"### {group}", "", "| case | error | mean | harm | ways |", "|---|---|---|---|---|"]
@@ -25,9 +25,9 @@ def _tables(measured: list[Measured], others: list[Row]) -> str:
         reasons = {(promise, reason): None for m in of_group for promise, reason in m.case.unpromised.items()}
         for promise, reason in reasons:
             names = [m.case.name for m in of_group if m.case.unpromised.get(promise) == reason]
-            lines += ["", f"*{promise}* is not promised for: {', '.join(names)}. Reason: {reason}."]
+            lines += ["", f"*{promise}* is not promised for: {'; '.join(names)}. Reason: {reason}."]
         parts.append("\n".join(lines) + "\n")
-    parts.append("### Beside the catalogue\n\n" + table(others) + "\n")
+    parts.append("### Other trials\n\n" + table(others) + "\n")
     return "\n".join(parts)
 
 
