@@ -62,6 +62,7 @@ def test_round_trip(model: Model, saved: Path) -> None:
     candidates=strategies.integers(0, 2),
     relmse=strategies.none() | strategies.floats(0, 1e9),
     seed=strategies.integers(0, 2**63 - 1),
+    members=strategies.integers(1, 16),
     data=strategies.data(),
 )
 def test_every_model_survives_its_file(
@@ -70,6 +71,7 @@ def test_every_model_survives_its_file(
     candidates: int,
     relmse: float | None,
     seed: int,
+    members: int,
     data: strategies.DataObject,
 ) -> None:
     reference = data.draw(strategies.integers(1, len(pilots) + candidates))
@@ -79,7 +81,7 @@ def test_every_model_survives_its_file(
     fit = Model(
         "pointwise",
         layout.planes,
-        first_weights(layout, seed),
+        first_weights(layout, seed, members),
         FitSettings("final", seed=seed),
         relmse,
         "0" * 64,
@@ -100,5 +102,8 @@ def test_a_model_is_written_whole_or_not_at_all(
         save_model(tmp_path / "m.onnx", model)
     weights = {**model.weights, "layer2.bias": np.zeros(3, np.float32)}
     with pytest.raises(InputError, match=r"layer2\.bias: expected shape \(16,\), found shape \(3,\)"):
+        save_model(tmp_path / "m.onnx", replace(model, weights=weights))
+    weights = {**model.weights, "layer1.bias": np.zeros(17 * 16, np.float32)}
+    with pytest.raises(InputError, match="17 members: expected at most 16"):
         save_model(tmp_path / "m.onnx", replace(model, weights=weights))
     assert list(tmp_path.iterdir()) == []

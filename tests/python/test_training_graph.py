@@ -70,6 +70,23 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
         np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-4, atol=1e-4)
 
 
+def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
+    examples, layout = examples_for_training()
+    weights = first_weights(layout, seed=3, members=3)
+    sizes = len(layout.planes), layout.choices
+    together = PointwiseNetwork(weights, *sizes)
+    parts = {name: np.split(value, 3) for name, value in weights.items()}
+    alone = [PointwiseNetwork({name: part[k] for name, part in parts.items()}, *sizes) for k in range(3)]
+    for first in range(0, 300, 100):
+        for network in (together, *alone):
+            network.step(examples.part(first, first + 100), 1e-2)
+    images = [network.fuse(examples) for network in alone]
+    assert not np.array_equal(images[0], images[1])
+    np.testing.assert_array_equal(together.fuse(examples), sum(images) / np.float32(3))
+    for name, value in together.weights().items():
+        np.testing.assert_array_equal(value, np.concatenate([network.weights()[name] for network in alone]))
+
+
 def test_gradients_are_those_of_the_loss() -> None:
     """Against central differences in double precision, without torch."""
     rng = np.random.default_rng(0)

@@ -49,13 +49,14 @@ class _Preset:
     pilots: tuple[Pilot, ...]
     steps: int
     batch_pixels: int = _BATCH_PIXELS
+    members: int = 1
     following: tuple[Pilot, ...] = FOLLOWING_PILOTS
 
 
 _PRESETS = {
-    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, FOLLOWING_DRAFT_PILOTS),
+    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, following=FOLLOWING_DRAFT_PILOTS),
     "balanced": _Preset(BALANCED_PILOTS, 240),
-    "final": _Preset(FINAL_PILOTS, 240),
+    "final": _Preset(FINAL_PILOTS, 240, members=4),
 }
 
 
@@ -82,7 +83,9 @@ def fit_fusion(
     layout = None if warm_start is None else warm_start.layout
     pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
     evidence = evidence_from_buffers(buffers, settings, pilots, candidates, clock, progress, previous, layout)
-    start = start_of_training(evidence, settings.seed, warm_start)
+    # A time budget is better spent on the steps of one.
+    members = preset.members if settings.time_budget_s is None else 1
+    start = start_of_training(evidence, settings.seed, warm_start, members)
     evidence = start.evidence
     network = PointwiseNetwork(
         start.weights, len(evidence.layout.planes), evidence.layout.choices, settings.device

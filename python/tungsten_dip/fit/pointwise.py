@@ -1,5 +1,8 @@
 """The network that chooses among pilots, pixel by pixel, and its training.
 
+It may be several networks of one shape, its members, that start from different weights and see the same
+examples; their mean errs less than each of them.
+
 A training step (forward, loss, gradients and the update of Adam, Kingma and Ba 2015) is one ONNX graph of
 plain operators. For a network as small as this one onnxruntime takes less time than torch, and loads in a
 fiftieth of it. Weights and moments go in and come out as one vector each, so that the update is written
@@ -86,7 +89,7 @@ def training_step(planes: int, choices: int) -> onnx.ModelProto:
 
 
 def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the weights, in the order in which the vectors of `training_step` hold them."""
+    """Return the shapes of one member's weights, in the order of the vectors of `training_step`."""
     sizes = (planes, HIDDEN, HIDDEN, choices)
     shapes: dict[str, tuple[int, ...]] = {}
     for layer in (1, 2, 3):
@@ -96,34 +99,36 @@ def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
 
 
 class PointwiseNetwork:
-    """The network and the state of its optimiser."""
+    """The members of a network and the states of their optimisers."""
 
     def __init__(self, weights: Weights, planes: int, choices: int, device: Device = "auto") -> None:
         self._shapes = weight_shapes(planes, choices)
         # The network is too small to share: threads would only wait for one another.
         self._step = session_from_proto(training_step(planes, choices), 1, device)
         self._fuse = session_from_proto(_forward(planes, choices), 1, device)
-        self._weights = self._vector(weights)
-        self._mean, self._square = np.zeros_like(self._weights), np.zeros_like(self._weights)
+        self._members = self._vectors(weights)
+        self._moments = [(np.zeros_like(member), np.zeros_like(member)) for member in self._members]
         self._steps_done = 0
 
     def step(self, batch: Examples, learning_rate: float) -> None:
-        """Train on some pixels by one step of Adam: the mean of their weighted squared errors falls."""
+        """Train every member on some pixels by one step of Adam: their weighted squared errors fall."""
         self._steps_done += 1
-        self._weights, self._mean, self._square = self._step.run(
-            ["next_weights", "next_mean", "next_square"],
-            {
-                "inputs": batch.inputs,
-                "choices": batch.choices,
-                "wanted": batch.wanted,
-                "weight": batch.weight,
-                "weights": self._weights,
-                "mean": self._mean,
-                "square": self._square,
-                "learning_rate": np.array([learning_rate], np.float32),
-                "step": np.array([self._steps_done], np.float32),
-            },
-        )
+        for index, (member, (mean, square)) in enumerate(zip(self._members, self._moments, strict=True)):
+            self._members[index], *moments = self._step.run(
+                ["next_weights", "next_mean", "next_square"],
+                {
+                    "inputs": batch.inputs,
+                    "choices": batch.choices,
+                    "wanted": batch.wanted,
+                    "weight": batch.weight,
+                    "weights": member,
+                    "mean": mean,
+                    "square": square,
+                    "learning_rate": np.array([learning_rate], np.float32),
+                    "step": np.array([self._steps_done], np.float32),
+                },
+            )
+            self._moments[index] = moments[0], moments[1]
 
     def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> FloatArray:
         """Return the weighted mean of the pilots or, by the same weights, of ``images``; shape (pixels, 3).
@@ -137,30 +142,38 @@ class PointwiseNetwork:
             feeds = {
                 "inputs": examples.inputs[part],
                 "choices": np.stack([image[part] for image in flat], 1) if flat else examples.choices[part],
-                "weights": self._weights,
             }
-            fused[part] = self._fuse.run(["fused"], feeds)[0]
+            by_members = (
+                self._fuse.run(["fused"], {**feeds, "weights": member})[0] for member in self._members
+            )
+            fused[part] = sum(by_members) / np.float32(len(self._members))
         if not np.isfinite(fused).all():
             raise InputError("the model gives no finite image: its weights are too large; fit a new one")
         return fused
 
     def weights(self) -> Weights:
-        """Return a copy of the weights, shaped as those of 1x1 convolutions."""
+        """Return a copy of the weights, as those of 1x1 convolutions with a group for every member."""
         copies: Weights = {}
         first = 0
         for name, shape in self._shapes.items():
             end = first + int(np.prod(shape))
             conv_shape = (*shape, 1, 1) if len(shape) == 2 else shape
-            copies[name] = self._weights[first:end].reshape(conv_shape).copy()
+            copies[name] = np.concatenate([member[first:end].reshape(conv_shape) for member in self._members])
             first = end
         return copies
 
     def load(self, weights: Weights) -> None:
         """Replace the weights."""
-        self._weights = self._vector(weights)
+        self._members = self._vectors(weights)
 
-    def _vector(self, weights: Weights) -> FloatArray:
-        return np.concatenate([weights[name].ravel() for name in self._shapes])
+    def _vectors(self, weights: Weights) -> list[FloatArray]:
+        parts = [np.split(weights[name], members_of(weights)) for name in self._shapes]
+        return [np.concatenate([part.ravel() for part in member]) for member in zip(*parts, strict=True)]
+
+
+def members_of(weights: Weights) -> int:
+    """Return how many members have these weights."""
+    return len(weights["layer1.bias"]) // HIDDEN
 
 
 def _forward(planes: int, choices: int) -> onnx.ModelProto:

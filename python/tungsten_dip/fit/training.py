@@ -72,8 +72,11 @@ class Start:
     notes: tuple[str, ...] = ()
 
 
-def start_of_training(evidence: Evidence, seed: int, model: Model | None = None) -> Start:
-    """Return the examples, and the weights of ``model`` or, where that knows no such images, new ones."""
+def start_of_training(evidence: Evidence, seed: int, model: Model | None = None, members: int = 1) -> Start:
+    """Return the examples, and the weights of ``model`` or, where that knows no such images, new ones.
+
+    New ones are those of so many ``members`` (`fit.pointwise`).
+    """
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()
     if model is not None and model.standardisation is not None:
@@ -86,7 +89,7 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None = None)
         inputs = network_inputs(evidence)
     standardisation = standardisation_of(inputs, evidence.threads)
     standardisation.apply(inputs, evidence.threads)
-    weights = first_weights(evidence.layout, seed)
+    weights = first_weights(evidence.layout, seed, members)
     return _start(evidence, inputs, standardisation, weights, warm=False, notes=notes)
 
 
@@ -117,19 +120,19 @@ def _start(
     return Start(evidence, examples, standardisation, weights, warm, notes)
 
 
-def first_weights(layout: Layout, seed: int) -> Weights:
-    """Return the weights that an untrained network starts from (He et al. 2015, uniform)."""
+def first_weights(layout: Layout, seed: int, members: int = 1) -> Weights:
+    """Return the weights that untrained networks start from (He et al. 2015, uniform)."""
     rng = np.random.default_rng(seed)
     sizes = (len(layout.planes), HIDDEN, HIDDEN, layout.choices)
     weights: Weights = {}
     for layer, (inputs, outputs) in enumerate(pairwise(sizes), start=1):
         bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs))
-        shape = (outputs, inputs, 1, 1)
+        shape = (members * outputs, inputs, 1, 1)
         weights[f"layer{layer}.weight"] = rng.uniform(-bound, bound, shape).astype(np.float32)
-        weights[f"layer{layer}.bias"] = np.zeros(outputs, np.float32)
+        weights[f"layer{layer}.bias"] = np.zeros(members * outputs, np.float32)
     # Starts from the mean of the pilots that the head start gives, whatever the seed.
     weights["layer3.weight"][:] = 0
-    weights["layer3.bias"][layout.reference] = _HEAD_START
+    weights["layer3.bias"][layout.reference :: layout.choices] = _HEAD_START
     return weights
 
 

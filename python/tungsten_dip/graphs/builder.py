@@ -52,10 +52,10 @@ class GraphBuilder:
         self._nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
-    def split(self, value: str, sizes: Sequence[int]) -> list[str]:
-        """Cut a vector into vectors of these sizes."""
+    def split(self, value: str, sizes: Sequence[int], axis: int = 0) -> list[str]:
+        """Cut a tensor into parts of these sizes along an axis."""
         outputs = [f"part {index} of {value}" for index in range(len(sizes))]
-        self._nodes.append(helper.make_node("Split", [value, self.integers(*sizes)], outputs, axis=0))
+        self._nodes.append(helper.make_node("Split", [value, self.integers(*sizes)], outputs, axis=axis))
         return outputs
 
     def model(

@@ -28,6 +28,9 @@ from tungsten_dip.fit.published import (
 )
 from tungsten_dip.graphs.builder import GraphBuilder
 
+_MOST_MEMBERS = 16
+"""Of a pointwise network: the memory that it takes grows with them."""
+
 
 def graph_of(model: Model, metadata: dict[str, str]) -> onnx.ModelProto:
     """Return the model's network with its weights.
@@ -78,9 +81,19 @@ class _Network(GraphBuilder):
         centred = self.add("Cast", centred, to=TensorProto.FLOAT)
         x = self.add("Div", centred, self.constant("std", std.reshape(-1, 1, 1)))
         x = self.add("Clip", x, self.number(-LARGEST_INPUT), self.number(LARGEST_INPUT))
-        x = self.leaky(self.conv(x, "layer1", planes, HIDDEN), POINTWISE_SLOPE)
-        x = self.leaky(self.conv(x, "layer2", HIDDEN, HIDDEN), POINTWISE_SLOPE)
-        x = self.add("Softmax", self.conv(x, "layer3", HIDDEN, choices), axis=1)
+        bias = self._weights.get("layer1.bias")
+        members = 1 if bias is None else max(bias.size // HIDDEN, 1)
+        if members > _MOST_MEMBERS:
+            raise InputError(f"the model has {members} members: expected at most {_MOST_MEMBERS}")
+        hidden = members * HIDDEN
+        x = self.leaky(self.conv(x, "layer1", planes, hidden), POINTWISE_SLOPE)
+        x = self.leaky(self.conv(x, "layer2", hidden, hidden, groups=members), POINTWISE_SLOPE)
+        x = self.conv(x, "layer3", hidden, members * choices, groups=members)
+        if members == 1:
+            x = self.add("Softmax", x, axis=1)
+        else:
+            parts = self.split(x, [choices] * members, axis=1)
+            x = self.add("Mean", *(self.add("Softmax", part, axis=1) for part in parts))
         mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "pilots")
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
@@ -147,12 +160,14 @@ class _Network(GraphBuilder):
         size: int = 1,
         stride: int = 1,
         bias: bool = True,
+        groups: int = 1,
     ) -> str:
         """Convolve, without padding."""
-        weights = [self.weight(f"{name}.weight", (outputs, inputs, size, size))]
+        weights = [self.weight(f"{name}.weight", (outputs, inputs // groups, size, size))]
         if bias:
             weights.append(self.weight(f"{name}.bias", (outputs,)))
-        return self.add("Conv", x, *weights, kernel_shape=[size, size], strides=[stride, stride])
+        grouped: dict[str, Any] = {"group": groups} if groups > 1 else {}
+        return self.add("Conv", x, *weights, kernel_shape=[size, size], strides=[stride, stride], **grouped)
 
     def norm(self, x: str, name: str, channels: int) -> str:
         """Normalise every image and channel by itself."""
