@@ -206,6 +206,61 @@ Array smooth_along_edges_array(const py::array& image, const py::array& tensor, 
     return out;
 }
 
+using Numbers = py::array_t<BFloat16, py::array::c_style>;
+
+// Takes an image in bfloat16, as bits, and its norm.
+NormAct norm_from_arrays(const Numbers& x, const Array& weight, const Array& bias, float epsilon,
+                         float slope) {
+    if (x.ndim() != 2 || x.shape(1) == 0 || x.shape(0) == 0 || weight.size() != x.shape(1) ||
+        bias.size() != x.shape(1)) {
+        throw py::value_error("expected pixels of some channels, and as many weights and biases");
+    }
+    return {.pixels = x.shape(0),
+            .channels = static_cast<int>(x.shape(1)),
+            .weight = weight.data(),
+            .bias = bias.data(),
+            .epsilon = epsilon,
+            .slope = slope};
+}
+
+py::tuple norm_act_arrays(const Numbers& x, const Array& weight, const Array& bias, float epsilon,
+                          float slope, int threads) {
+    const NormAct norm = norm_from_arrays(x, weight, bias, epsilon, slope);
+    Numbers y({x.shape(0), x.shape(1)});
+    Array mean(x.shape(1));
+    Array scale(x.shape(1));
+    const auto [from, to] = std::pair(x.data(), y.mutable_data());
+    const auto [means, scales] = std::pair(mean.mutable_data(), scale.mutable_data());
+    {
+        const py::gil_scoped_release release;
+        norm_act(norm, from, to, means, scales, threads);
+    }
+    return py::make_tuple(y, mean, scale);
+}
+
+py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, const Array& weight,
+                                   const Array& bias, float epsilon, float slope, const Numbers& y,
+                                   const Array& mean, const Array& scale, int threads) {
+    const NormAct norm = norm_from_arrays(x, weight, bias, epsilon, slope);
+    if (y.size() != x.size() || gradient.size() != x.size() || mean.size() != x.shape(1) ||
+        scale.size() != x.shape(1)) {
+        throw py::value_error(
+            "expected outputs and gradients in the shape of x, and moments of its channels");
+    }
+    Numbers by_x({x.shape(0), x.shape(1)});
+    Array by_weight(x.shape(1));
+    Array by_bias(x.shape(1));
+    const auto [inputs, outputs] = std::pair(x.data(), y.data());
+    const auto [by_y, to] = std::pair(gradient.data(), by_x.mutable_data());
+    const auto [means, scales] = std::pair(mean.data(), scale.data());
+    const auto [weights, biases] = std::pair(by_weight.mutable_data(), by_bias.mutable_data());
+    {
+        const py::gil_scoped_release release;
+        norm_act_gradient(norm, inputs, outputs, means, scales, by_y, to, weights, biases, threads);
+    }
+    return py::make_tuple(by_x, by_weight, by_bias);
+}
+
 }  // namespace
 }  // namespace tungsten_dip
 
@@ -239,4 +294,10 @@ PYBIND11_MODULE(_core, module) {
     module.def("structure_tensor", &structure_tensor_array, py::arg("features"), py::arg("threads") = 0);
     module.def("smooth_along_edges", &smooth_along_edges_array, py::arg("image"), py::arg("tensor"),
                py::kw_only(), py::arg("along"), py::arg("across"), py::arg("threads") = 0);
+    module.def("norm_act", &norm_act_arrays, py::arg("x").noconvert(), py::arg("weight").noconvert(),
+               py::arg("bias").noconvert(), py::arg("epsilon"), py::arg("slope"), py::arg("threads") = 0);
+    module.def("norm_act_gradient", &norm_act_gradient_arrays, py::arg("gradient").noconvert(),
+               py::arg("x").noconvert(), py::arg("weight").noconvert(), py::arg("bias").noconvert(),
+               py::arg("epsilon"), py::arg("slope"), py::arg("y").noconvert(), py::arg("mean").noconvert(),
+               py::arg("scale").noconvert(), py::arg("threads") = 0);
 }

@@ -162,4 +162,27 @@ void structure_tensor(ConstImage features, Image out, int threads);
 void smooth_along_edges(ConstImage image, ConstImage tensor, float along, float across, Image out,
                         int threads);
 
+// --- norm_act.cpp
+
+using BFloat16 = std::uint16_t;  // the upper half of a float
+
+// Batch norm, with the statistics of the image in hand, and leaky ReLU of an image in bfloat16: `pixels` rows
+// of `channels` numbers, with a weight and a bias for each channel. For few channels PyTorch's own is slow.
+struct NormAct {
+    std::int64_t pixels = 0;
+    int channels = 0;
+    const float* weight = nullptr;
+    const float* bias = nullptr;
+    float epsilon = 0;  // added to the variance
+    float slope = 0;    // of the leaky ReLU, below 0
+};
+
+// Writes the output y and, for each channel, the mean and one over the standard deviation.
+void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale, int threads);
+
+// Given these and the gradient of y, writes the gradients of x (which may be y's in place), weight and bias.
+void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y, const float* mean,
+                       const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
+                       float* by_bias, int threads);
+
 }  // namespace tungsten_dip

@@ -7,7 +7,10 @@ Inputs are read in place, also read-only ones. The interpreter lock is released 
 
 from collections.abc import Sequence
 
-from tungsten_dip.buffers.model import FloatImage
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.model import FloatArray, FloatImage
 
 class Defects:
     """How many values of an image no renderer can have meant."""
@@ -102,3 +105,28 @@ def smooth_along_edges(
 
     ``along`` and ``across`` are its standard deviations in pixels. See ``smooth_along_edges`` in core.hpp.
     """
+
+Bits = npt.NDArray[np.uint16]
+"""An image in bfloat16, shape (pixels, channels), as the bits of its numbers."""
+
+def norm_act(
+    x: Bits, weight: FloatArray, bias: FloatArray, epsilon: float, slope: float, threads: int = 0
+) -> tuple[Bits, FloatArray, FloatArray]:
+    """Return batch norm and leaky ReLU of an image, and mean and 1 / standard deviation of its channels.
+
+    ``weight`` and ``bias`` are the norm's, one for each channel. ``epsilon`` is added to the variance.
+    """
+
+def norm_act_gradient(
+    gradient: Bits,
+    x: Bits,
+    weight: FloatArray,
+    bias: FloatArray,
+    epsilon: float,
+    slope: float,
+    y: Bits,
+    mean: FloatArray,
+    scale: FloatArray,
+    threads: int = 0,
+) -> tuple[Bits, FloatArray, FloatArray]:
+    """Return the gradients of x, weight and bias, given that of y and what `norm_act` took and returned."""

@@ -9,14 +9,16 @@ the input alike).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from tungsten_dip import _core
 from tungsten_dip.fit.published import (
     LEAKY_SLOPE,
     NORM_EPSILON,
@@ -28,10 +30,6 @@ from tungsten_dip.fit.published import (
 
 Pointwise = Callable[[Tensor], Tensor]
 """A function that treats every pixel alike and by itself."""
-
-_FEW_CHANNELS = 8
-_LONG_ROW = 128
-"""Numbers in a row of `_FewChannelsNormAct`, if the pixels divide so."""
 
 
 class Skip(nn.Module):
@@ -126,51 +124,40 @@ class _NormAct(_Norm):
     """Batch norm, then leaky ReLU in place."""
 
     def forward(self, x: Tensor) -> Tensor:
-        if x.device.type == "cpu" and self.num_features <= _FEW_CHANNELS:
-            normed = _FewChannelsNormAct.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
-            return cast(Tensor, normed)
+        if x.device.type == "cpu" and x.dtype == torch.bfloat16:
+            return cast(Tensor, _NormActOnCpu.apply(x, self.weight, self.bias))  # type: ignore[no-untyped-call]
         return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
 
 
-class _FewChannelsNormAct(torch.autograd.Function):
-    """Batch norm and leaky ReLU of an image of few channels, for which PyTorch's own norm is slow.
-
-    All is done on a matrix whose rows are several pixels each: a processor goes through long rows faster.
-    """
+class _NormActOnCpu(torch.autograd.Function):
+    """Batch norm and leaky ReLU in bfloat16, by the core: PyTorch goes through memory more often."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """Take (batch, channels, height, width) and two vectors of channels."""
-        channels = x.shape[1]
-        pixels = x.numel() // channels
-        ctx.per_row = per_row = math.gcd(pixels, _LONG_ROW // channels)
         ctx.shape = x.permute(0, 2, 3, 1).shape
-        rows = x.permute(0, 2, 3, 1).reshape(-1, per_row * channels).to(weight.dtype, copy=True)
-        rows -= (_sums(rows, channels) / pixels).repeat(per_row)
-        scale = torch.rsqrt(_sums(rows.square(), channels) / pixels + NORM_EPSILON)
-        y = torch.addcmul(bias.repeat(per_row), rows, (weight * scale).repeat(per_row)).to(x.dtype)
-        F.leaky_relu_(y, LEAKY_SLOPE)
-        ctx.save_for_backward(rows, weight, scale, y)
-        return y.view(ctx.shape).permute(0, 3, 1, 2)
+        norm = _bits(x), weight.detach().numpy(), bias.detach().numpy(), NORM_EPSILON, LEAKY_SLOPE
+        threads = torch.get_num_threads()
+        y, mean, scale = _core.norm_act(*norm, threads)
+        ctx.kept = *norm, y, mean, scale, threads
+        return _image(y, ctx.shape)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the gradients of what came in."""
-        rows, weight, scale, y = ctx.saved_tensors
-        channels = len(weight)
-        dy = grad.permute(0, 2, 3, 1).reshape(rows.shape)
-        dy = torch.ops.aten.leaky_relu_backward(dy, y, LEAKY_SLOPE, True).to(rows.dtype)
-        grad_bias, grad_weight = _sums(dy, channels), _sums(dy * rows, channels) * scale
-        factor = weight * scale
-        share = factor * channels / rows.numel()
-        dx = torch.addcmul((-share * grad_bias).repeat(ctx.per_row), dy, factor.repeat(ctx.per_row))
-        dx.addcmul_(rows, (-share * scale * grad_weight).repeat(ctx.per_row))
-        return dx.to(grad.dtype).view(ctx.shape).permute(0, 3, 1, 2), grad_weight, grad_bias
+        by_x, by_weight, by_bias = _core.norm_act_gradient(_bits(grad), *ctx.kept)
+        return _image(by_x, ctx.shape), torch.from_numpy(by_weight), torch.from_numpy(by_bias)
 
 
-def _sums(rows: Tensor, channels: int) -> Tensor:
-    """Sum what `_FewChannelsNormAct` has of each channel."""
-    return rows.sum(0).view(-1, channels).sum(0)
+def _bits(image: Tensor) -> npt.NDArray[np.uint16]:
+    """The pixels of a bfloat16 image, shape (pixels, channels), as numpy can hold them."""
+    rows = image.detach().permute(0, 2, 3, 1).flatten(0, 2).contiguous()
+    return cast("npt.NDArray[np.uint16]", rows.view(torch.uint16).numpy())
+
+
+def _image(bits: npt.NDArray[np.uint16], shape: torch.Size) -> Tensor:
+    """Undo `_bits`, for an image of this shape with its channels last."""
+    return torch.from_numpy(bits).view(torch.bfloat16).view(shape).permute(0, 3, 1, 2)
 
 
 class _MirroringConv(nn.Conv2d):
