@@ -292,9 +292,9 @@ def test_visibility_is_what_arrives_of_the_light() -> None:
     np.testing.assert_array_equal(covered.color.mean, 0)
 
 
-@pytest.mark.parametrize("spp", [2, 5])
-def test_halves_make_up_the_mean(spp: int) -> None:
-    buffers = render_translated(ball(), spp=spp)
+@pytest.mark.parametrize(("spp", "spp_step"), [(2, 2), (5, 5), (8, 1), (7, 1), (9, 3), (8, 5)])
+def test_halves_make_up_the_mean(spp: int, spp_step: int) -> None:
+    buffers = render_translated(ball(), spp=spp, timeout_s=1e9, spp_step=spp_step)
     count_a, count_b = (spp + 1) // 2, spp // 2
     for _, buffer in buffers.quantities():
         assert buffer.half_a is not None

@@ -204,11 +204,15 @@ class _Statistics:
         shift = (
             (other.mean - self.mean) ** 2 * self.count * other.count / np.maximum(self.count + other.count, 1)
         )
+        # Where half A has one sample more, the next one is half B's.
+        swaps = self.count_a > self.count_b
+        count_a = np.where(swaps, other.count_b, other.count_a)
+        count_b = np.where(swaps, other.count_a, other.count_b)
         return _Statistics(
-            _weighted_mean(self.half_a, self.count_a, other.half_a, other.count_a),
-            _weighted_mean(self.half_b, self.count_b, other.half_b, other.count_b),
-            self.count_a + other.count_a,
-            self.count_b + other.count_b,
+            _weighted_mean(self.half_a, self.count_a, np.where(swaps, other.half_b, other.half_a), count_a),
+            _weighted_mean(self.half_b, self.count_b, np.where(swaps, other.half_a, other.half_b), count_b),
+            self.count_a + count_a,
+            self.count_b + count_b,
             self.squared_deviations + other.squared_deviations + shift,
         )
 
