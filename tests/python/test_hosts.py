@@ -15,6 +15,7 @@ from tungsten_dip import hosts
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts import memory, tungsten
+from tungsten_dip.hosts.mitsuba.render import render
 from tungsten_dip.scene import load_scene
 
 
@@ -115,6 +116,11 @@ def test_available_memory_is_a_part_of_the_whole() -> None:
     available = memory._available_bytes()
     assert available is not None
     assert 0 < available < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def test_unknown_quantities_are_told_before_memory_is(scene_path: Path) -> None:
+    with pytest.raises(InputError, match=r"quantities: expected color and others of .*, got color, albdo"):
+        render(load_scene(scene_path), quantities=("color", "albdo"))
 
 
 def test_unknown_host(scene_path: Path) -> None:

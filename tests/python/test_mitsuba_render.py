@@ -475,7 +475,13 @@ def test_cancel_ends_a_path_without_end() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"spp": 0}, {"spp": 1, "seed": -1}, {"spp": 1, "threads": 0}, {"spp": 1, "quantities": ("depth",)}],
+    [
+        {"spp": 0},
+        {"spp": 1, "seed": -1},
+        {"spp": 1, "threads": 0},
+        {"spp": 1, "quantities": ("depth",)},
+        {"spp": 1, "quantities": ("color", "albdo")},
+    ],
 )
 def test_arguments_out_of_range(arguments: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"expected (a number|color)"):

@@ -63,6 +63,7 @@ def render(
         _log.info(
             "adaptive_sampling and stratified_sampler rest: every pixel gets as many independent samples"
         )
+    _check_quantities(quantities)
     check_fits_mitsuba(scene, quantities)
     with mitsuba_variant():
         from tungsten_dip.hosts.mitsuba.translate import translate
@@ -97,8 +98,7 @@ def render_translated(
     for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
         if value is not None and not 1 <= value < 2**31:
             raise InputError(f"{name}: expected a number from 1 to {2**31 - 1}, got {value}")
-    if "color" not in quantities:
-        raise InputError(f"quantities: expected color among them, got {', '.join(quantities)}")
+    _check_quantities(quantities)
     if not 0 <= seed < 2**32:
         raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {seed}")
     started = time.perf_counter()
@@ -134,6 +134,13 @@ def render_translated(
         spp=float(done_spp),
         attributes={"renderer": f"Mitsuba {VERSION}", "integrator": "path_tracer", "seed": str(seed)},
     )
+
+
+def _check_quantities(quantities: Sequence[str]) -> None:
+    if "color" not in quantities or not set(quantities) <= set(CHANNELS):
+        raise InputError(
+            f"quantities: expected color and others of {', '.join(CHANNELS)}, got {', '.join(quantities)}"
+        )
 
 
 def _scene_with_integrator(
