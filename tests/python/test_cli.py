@@ -15,7 +15,7 @@ import pytest
 import tungsten_dip
 from conftest import SCENE
 from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
-from tungsten_dip.cli import tungsten
+from tungsten_dip.cli import entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
@@ -724,6 +724,33 @@ def test_ctrl_c_while_libraries_load_is_one_line():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "tungsten: interrupted\n")
+
+
+def test_ctrl_c_that_a_handler_in_c_has_is_left_to_it(monkeypatch):
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as of_c:
+        of_c.setattr(signal, "getsignal", lambda number: None)
+        with entry._leaving_on_interrupt("tungsten"):
+            assert signal.signal(signal.SIGINT, handler) is handler
+
+
+def test_ctrl_c_that_is_ignored_does_not_end_a_render(scene):
+    program = (
+        "import os, signal, sys\n"
+        "from tungsten_dip.cli import entry\n"
+        "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "with entry._leaving_on_interrupt('tungsten'):\n"
+        "    from tungsten_dip.hosts.mitsuba.render import render\n"
+        "    from tungsten_dip.scene import load_scene\n"
+        "pressed = []\n"
+        "def press(fraction, message):\n"
+        "    if fraction < 1:\n"
+        "        pressed.append(os.kill(os.getpid(), signal.SIGINT))\n"
+        "render(load_scene(sys.argv[1]), spp=20000, threads=1, progress=press)\n"
+        "assert pressed\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(scene)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_ctrl_c_waits_for_an_import():

@@ -34,7 +34,12 @@ def _leaving_on_interrupt(command: str) -> Iterator[None]:
         os._exit(_INTERRUPTED)
 
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as of a process in the background
-        signal.signal(signal.SIGINT, leave)
+    if before is signal.SIG_IGN:
+        # As of a process in the background; Mitsuba, which has a handler of its own, shall not see it either.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    if before in (signal.SIG_IGN, None):  # None is a handler that Python does not know
+        yield
+        return
+    signal.signal(signal.SIGINT, leave)
     yield
     signal.signal(signal.SIGINT, before)
