@@ -32,7 +32,7 @@ def mitsuba_variant() -> Iterator[ModuleType]:
 
     The caller's variant and log are back afterwards. May be nested.
 
-    Raises InputError if Mitsuba or our plugins are missing.
+    Raises InputError if Mitsuba, our plugins or the working directory are missing.
     """
     if importlib.util.find_spec("mitsuba") is None:
         raise InputError("rendering needs the package mitsuba: pip install 'tungsten-dip[mitsuba]'")
@@ -45,6 +45,10 @@ def mitsuba_variant() -> Iterator[ModuleType]:
         raise InputError(
             "tungsten-dip was built without its Mitsuba plugins; install mitsuba, then build it again"
         )
+    try:
+        Path.cwd()  # without which importing Mitsuba ends the process
+    except OSError:
+        raise InputError("the working directory does not exist any more; change to one that does") from None
     with held_interrupts():
         mitsuba = importlib.import_module("mitsuba")
         previous_variant = mitsuba.variant()
