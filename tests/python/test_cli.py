@@ -329,6 +329,18 @@ def test_a_render_writes_what_the_scene_asks_for(scene, tmp_path, renders):
     assert read_image(tmp_path / "picture.exr").shape == (height, width, 3)
 
 
+def test_no_plane_of_an_earlier_render_stays(scene, tmp_path, capfd):
+    before = {}
+    for spp in (2, 1, 2):
+        assert tungsten.main(["--host", "mitsuba", "--spp", str(spp), str(scene)]) == 0
+        before[spp] = {path.name for path in tmp_path.iterdir()}
+    planes = {f"n{plane}{suffix}" for plane in ("A", "B", "Variance") for suffix in (".exr", ".png")}
+    assert before[2] - before[1] == planes
+    removed = [line for line in capfd.readouterr().err.splitlines() if "removed what an earlier" in line]
+    assert len(removed) == 1
+    assert all(name in removed[0] for name in planes)
+
+
 def test_denoised_pictures_lie_beside_the_noisy_ones(tmp_path, renders, fits, capfd):
     scene = write_scene(tmp_path / "scene.json", hdr_output_file="", output_buffers=[])
     report = tmp_path / "page.html"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers import PLANES, Buffer, FloatImage, RenderBuffers, check_writable, write_image
+from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene
@@ -90,28 +90,35 @@ def _known(name: str, suffixes: tuple[str, ...]) -> str:
 
 
 def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) -> None:
-    """Write the picture and the buffers that the scene asks for."""
+    """Write the picture and the buffers that the scene asks for.
+
+    What it asks for and this render does not have, such as the halves of 1 spp, is removed where an earlier
+    render left it: it would pass for this one's.
+    """
     if outputs.hdr is not None:
         write_image(outputs.hdr, buffers.color.mean)
     if outputs.ldr is not None:
         write_image(outputs.ldr, display_from_radiance(buffers.color.mean, tonemap))
+    outdated = []
     for request in outputs.buffers:
-        buffer: Buffer | None = getattr(buffers, request.type)
-        if buffer is None:
-            continue
-        for plane, array in _requested(buffer, request):
-            for name in filter(None, (request.hdr_output_file, request.ldr_output_file)):
-                path = Path(name)
-                is_ldr = name == request.ldr_output_file
-                image = _displayed_buffer(array, request.type, plane) if is_ldr else array
-                write_image(path.with_name(path.stem + PLANES[plane] + path.suffix), image)
+        for plane, path in _files_of(request):
+            array: FloatImage | None = getattr(getattr(buffers, request.type), plane, None)
+            if array is not None:
+                is_ldr = path.suffix.lower() in _LDR
+                write_image(path, _displayed_buffer(array, request.type, plane) if is_ldr else array)
+            elif path.is_file():
+                path.unlink()
+                outdated.append(path.name)
+    if outdated:
+        _LOG.info("removed what an earlier render left and this one does not have: %s", ", ".join(outdated))
 
 
-def _requested(buffer: Buffer, request: OutputBuffer) -> Iterator[tuple[str, FloatImage]]:
-    for plane, array in buffer.planes():
-        asked = {"mean": True, "variance": request.sample_variance}.get(plane, request.two_buffer_variance)
-        if asked:
-            yield plane, array
+def _files_of(request: OutputBuffer) -> Iterator[tuple[str, Path]]:
+    """Yield the plane and the path of every file of a buffer."""
+    for plane, suffix in PLANES.items():
+        if {"mean": True, "variance": request.sample_variance}.get(plane, request.two_buffer_variance):
+            for path in map(Path, filter(None, (request.hdr_output_file, request.ldr_output_file))):
+                yield plane, path.with_name(path.stem + suffix + path.suffix)
 
 
 def _displayed_buffer(array: FloatImage, quantity: str, plane: str) -> FloatImage:
