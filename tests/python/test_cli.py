@@ -427,11 +427,37 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     assert capfd.readouterr().err.splitlines()[-1] == "tungsten: interrupted"
 
 
-def test_scenes_that_would_write_over_one_another_are_refused(tmp_path, renders, capfd):
-    scenes = [write_scene(tmp_path / name) for name in ("a.json", "b.json")]
+@pytest.mark.parametrize("second", ["b.json", "sub/../a.json"])
+def test_scenes_that_would_write_over_one_another_are_refused(second, tmp_path, renders, capfd):
+    (tmp_path / "sub").mkdir()
+    scenes = [write_scene(tmp_path / name) for name in ("a.json", second)]
     assert tungsten.main(["--dip-denoise", "--host", "mitsuba", *map(str, scenes)]) != 0
+    assert f"{second}: would write over" in capfd.readouterr().err
+    assert len(renders) == 1
+
+
+def test_a_scene_whose_buffers_would_write_over_a_picture_is_refused(tmp_path, renders, capfd):
+    buffers = [{"type": "normal", "hdr_output_file": "one_denoised.exr"}]
+    one = write_scene(tmp_path / "a.json", output_file="one.png", hdr_output_file="", output_buffers=[])
+    two = write_scene(tmp_path / "b.json", output_file="two.png", output_buffers=buffers)
+    assert tungsten.main(["--dip-denoise", str(one), str(two)]) == 2
     assert "b.json: would write over" in capfd.readouterr().err
-    assert len(list(tmp_path.glob("*_denoised.exr"))) == 1
+    assert len(renders) == 1
+
+
+@pytest.mark.parametrize("name", ["picture_denoised.exr", "sub/../picture_denoised.exr"])
+@pytest.mark.parametrize("given", ["option", "buffer"])
+def test_a_render_that_the_denoised_picture_would_write_over_is_refused(
+    name, given, tmp_path, renders, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    buffers = [{"type": "normal", "hdr_output_file": name}] if given == "buffer" else []
+    scene = write_scene(tmp_path / "scene.json", output_buffers=buffers)
+    options = ["-e", name] if given == "option" else []
+    assert tungsten.main(["--dip-denoise", *options, str(scene)]) == 2
+    fails(capfd, 2, "picture_denoised.exr: named for the render")
+    assert renders == []
 
 
 def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, capfd, monkeypatch):

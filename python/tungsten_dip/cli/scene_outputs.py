@@ -41,6 +41,12 @@ class SceneOutputs:
         """Return the outputs with the picture written both displayed and as radiance."""
         return replace(self, ldr=self.ldr or self.beside(".png"), hdr=self.hdr or self.beside(".exr"))
 
+    def files(self) -> Iterator[Path]:
+        """Yield the path of every file."""
+        yield from filter(None, (self.ldr, self.hdr))
+        for request in self.buffers:
+            yield from (path for _, path in _files_of(request))
+
     def check(self) -> None:
         """Raise InputError if one of the files cannot be written."""
         for path in filter(None, [self.ldr, *(_path(buffer.ldr_output_file) for buffer in self.buffers)]):

@@ -204,7 +204,7 @@ def _render_scene(
 def _checked_outputs(
     scene: Scene, path: Path, options: argparse.Namespace, denoised: set[Path]
 ) -> SceneOutputs:
-    """Return what a scene writes, all of which can be written."""
+    """Return what a scene writes: all of it can be written, and over no denoised picture."""
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
@@ -217,15 +217,20 @@ def _checked_outputs(
     if options.dip_denoise:
         outputs = outputs.with_both_pictures()
     outputs.check()
-    if options.dip_denoise:
-        for derived in _denoised_paths(outputs):
-            if derived in denoised:
-                raise InputError(
-                    f"{path}: would write over {derived}, which belongs to a scene before; give every scene "
-                    f"an output_file of its own"
-                )
-            denoised.add(derived)
-            check_writable(derived, (derived.suffix,))
+    own = _denoised_paths(outputs) if options.dip_denoise else ()
+    for file in own:
+        check_writable(file, (file.suffix,))
+    rendered, derived = ({file.resolve() for file in files} for files in (outputs.files(), own))
+    both = rendered & derived
+    if both:
+        raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")
+    overwritten = denoised & (rendered | derived)
+    if overwritten:
+        raise InputError(
+            f"{path}: would write over {min(overwritten)}, which belongs to a scene before; give every scene "
+            f"an output_file of its own"
+        )
+    denoised |= derived
     if options.report is not None:
         check_writable(options.report, (".html",))
     if options.save_model is not None:
