@@ -578,6 +578,16 @@ def test_any_mix_of_channel_names_reads_or_is_refused(tmp_path: Path, names: lis
         assert channel.dtype == np.float16
 
 
+@pytest.mark.parametrize("order", ["+Y 2 +X 8", "-Y 2 -X 8", "+X 8 -Y 2"])
+def test_radiance_pictures_in_another_order_of_pixels_are_refused(tmp_path: Path, order: str) -> None:
+    for known in ("-Y 2 +X 8", order):
+        header = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n{known}\n"
+        (tmp_path / f"{known}.hdr").write_bytes(header.encode() + bytes(range(64)))
+    assert read_image(tmp_path / "-Y 2 +X 8.hdr").shape == (2, 8, 3)
+    with pytest.raises(InputError, match="expected rows from the top down"):
+        read_image(tmp_path / f"{order}.hdr")
+
+
 @pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
 def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> None:
     write_image(tmp_path / "a.png", np.ones((3, 4, 3), np.float32))

@@ -190,6 +190,11 @@ def _part(path: Path, image: Any, index: int) -> Part:
         )
     if spec.nchannels == 0:
         raise InputError(f"{path}: holds no channels; render it again")
+    if path.suffix.lower() == ".hdr" and spec.get_int_attribute("Orientation", 1) != 1:
+        raise InputError(
+            f"{path}: expected rows from the top down, each from the left (-Y +X), got another order; turn "
+            f"it with oiiotool IN.hdr --reorient -o OUT.hdr"
+        )
     formats = [spec.channelformat(channel) for channel in range(spec.nchannels)]
     if path.suffix.lower() in RADIANCE_SUFFIXES and not {"uint8", "uint16"}.isdisjoint(map(str, formats)):
         raise InputError(f"{path}: holds no linear radiance but a picture of few bits; save it as .exr")
