@@ -15,6 +15,8 @@ import pytest
 import tungsten_dip
 from conftest import SCENE
 from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
+from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes
@@ -312,6 +314,19 @@ def test_compare_images_of_two_sizes(tmp_path, capfd):
     write_image(image, np.ones((4, 5, 3), np.float32))
     write_image(reference, np.ones((5, 4, 3), np.float32))
     fails(capfd, command.main(["compare", str(image), str(reference)]), "(4, 5, 3)", "(5, 4, 3)")
+
+
+def test_compare_the_same_pixels_at_two_places(tmp_path, render, capfd):
+    for name, column in (("there.exr", 5), ("here.exr", 0)):
+        window = (np.array([column, 0], np.int32), np.array([column + 55, 39], np.int32))
+        channels = {name: render.reference[..., index] for index, name in enumerate("RGB")}
+        write_exr(tmp_path / name, [Part(channels, {"dataWindow": window})])
+    write_image(tmp_path / "anywhere.pfm", render.reference)
+    paths = [str(tmp_path / name) for name in ("there.exr", "here.exr", "anywhere.pfm")]
+    assert command.main(["compare", *paths[:2]]) == 2
+    fails(capfd, 2, "there.exr: expected pixels from (0, 0) on", "(5, 0)")
+    assert command.main(["compare", *paths[::2]]) == 0
+    assert command.main(["compare", paths[0], paths[0]]) == 0
 
 
 # --- tungsten ---------------------------------------------------------------------------------------

@@ -62,6 +62,17 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
 
 
+def first_pixel(path: Path) -> tuple[int, int] | None:
+    """Return column and row of the first pixel of a readable .exr file (of its first part, if of several).
+
+    None for a format that does not say where its pixels are.
+    """
+    if path.suffix.lower() != ".exr":
+        return None
+    column, row = OpenEXR.File(str(path), header_only=True).parts[0].header["dataWindow"][0]
+    return int(column), int(row)
+
+
 def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> None:
     """Write the parts, every channel in its own pixel type, compressed without loss, whole or not at all.
 

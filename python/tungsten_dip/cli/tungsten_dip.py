@@ -20,6 +20,7 @@ from tungsten_dip.buffers import (
     write_denoised,
     write_image,
 )
+from tungsten_dip.buffers.image_file import first_pixel
 from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.bench import add_bench
 from tungsten_dip.cli.console import (
@@ -252,6 +253,13 @@ def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
 
 
 def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    facts = asdict(tungsten_dip.compare(read_image(options.image), read_image(options.reference)))
+    image, reference = read_image(options.image), read_image(options.reference)
+    begin, expected = first_pixel(options.image), first_pixel(options.reference)
+    if begin != expected and None not in (begin, expected):
+        raise InputError(
+            f"{options.image}: expected pixels from {expected} on as {options.reference} has, got them from "
+            f"{begin}; bring both to one data window"
+        )
+    facts = asdict(tungsten_dip.compare(image, reference))
     lines = (f"{name:<11}{'-' if value is None else f'{value:.5g}'}" for name, value in facts.items())
     return facts, "\n".join(lines)
