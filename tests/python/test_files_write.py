@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -22,6 +24,7 @@ from hypothesis import strategies as st
 from tungsten_dip.buffers import (
     Buffer,
     RenderBuffers,
+    atomic,
     check_writable,
     read_buffers,
     read_image,
@@ -439,6 +442,39 @@ def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
     with replacing(path) as temporary:
         temporary.write_text("new")
     assert [file.read_text() for file in tmp_path.iterdir()] == ["new"]
+
+
+def test_a_file_that_another_process_takes_for_one_left_by_the_dead_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = fcntl.flock
+    raced = []
+
+    def late(file: Any, flags: int) -> None:
+        if not raced:
+            raced.append(file)
+            atomic._remove_left_by_the_dead(tmp_path / "a.txt")
+        lock(file, flags)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with replacing(tmp_path / "a.txt") as temporary:
+        assert raced
+        assert temporary.exists()
+        temporary.write_text("whole")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
+
+
+def test_a_check_whose_file_another_process_removes_succeeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unlink = Path.unlink
+
+    def late(path: Path, missing_ok: bool = False) -> None:
+        path.rename(tmp_path / "gone")
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", late)
+    check_writable(tmp_path / "a.exr")
 
 
 def test_a_link_stays_a_link_and_the_umask_holds(tmp_path: Path) -> None:

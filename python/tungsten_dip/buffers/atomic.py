@@ -24,21 +24,15 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises InputError if the file system refuses (no such folder, read-only, full).
     """
     target = _resolved(path)
-    temporary = _temporary(target)
     try:
         _remove_left_by_the_dead(target)
-        with temporary.open("xb") as lock:
-            _try_to_lock(lock.fileno())
+        with _locked_temporary(target) as temporary:
             yield temporary
             with temporary.open("rb+") as written:
                 os.fsync(written.fileno())
             temporary.replace(target)
-    except BaseException as error:
-        with suppress(OSError):  # such as that the name is too long to exist
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
-        raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -62,7 +56,7 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
             raise InputError(f"{path}: expected the name of a file, this is a folder")
         temporary = _temporary(_resolved(path))
         temporary.open("xb").close()
-        temporary.unlink()
+        temporary.unlink(missing_ok=True)  # as another process may have done, which took its writer for dead
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
 
@@ -78,6 +72,23 @@ def _temporary(target: Path) -> Path:
     return target.with_name(f".{target.stem}-{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
 
 
+@contextmanager
+def _locked_temporary(target: Path) -> Iterator[Path]:
+    """Create a temporary file and hold the lock that tells that its writer lives; remove it on leaving."""
+    while True:
+        temporary = _temporary(target)
+        try:
+            with temporary.open("xb") as file:
+                with suppress(OSError):  # of a file system without locks, where nothing is removed either
+                    fcntl.flock(file, fcntl.LOCK_EX)
+                if temporary.exists():  # Until it was locked, another process could take its writer for dead.
+                    yield temporary
+                    return
+        finally:
+            with suppress(OSError):  # such as that it is in its place, or that its name is too long to exist
+                temporary.unlink()
+
+
 def _remove_left_by_the_dead(target: Path) -> None:
     """Remove temporary files of ``target`` whose writers live no more: these alone are not locked."""
     name = re.compile(
@@ -86,18 +97,9 @@ def _remove_left_by_the_dead(target: Path) -> None:
     with suppress(OSError):
         for path in target.parent.iterdir():
             if name.fullmatch(path.name):
-                with path.open("rb") as left:
-                    if _try_to_lock(left.fileno()):
-                        path.unlink()
-
-
-def _try_to_lock(file: int) -> bool:
-    """Lock a file for as long as it is open; return whether that was possible."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+                with suppress(OSError), path.open("rb") as left:
+                    fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.unlink()
 
 
 _TOKEN_BYTES = 4
