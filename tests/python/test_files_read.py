@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from tungsten_dip.buffers import Buffer, RenderBuffers, image_file, read_buffers, read_image, write_image
+from tungsten_dip.buffers.read import input_files
 from tungsten_dip.errors import InputError
 
 HEIGHT, WIDTH = 5, 7
@@ -362,6 +363,10 @@ def test_a_folder_of_tungsten(tmp_path: Path, suffix: str, caplog: pytest.LogCap
     for _, buffer in buffers.quantities():
         assert len(list(buffer.planes())) == 4
     assert f"ignored: nfor{suffix}" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        assert len(input_files(tmp_path)) == len(keys)
+    assert not caplog.records  # what is ignored is told by who reads
 
 
 def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -540,7 +545,7 @@ def test_without_colour(tmp_path: Path) -> None:
     save(tmp_path / "a.exr", *rgb("albedo"), "Z")
     refused(tmp_path / "a.exr", "no colour.*found Z, albedo; use --map color=LAYER")
     save(tmp_path / "b.exr", "R", "G")
-    refused(tmp_path / "b.exr", "no colour")
+    refused(tmp_path / "b.exr", "no colour.*found R, G; use --map")
     with pytest.raises(InputError, match="R, G, B or Y"):
         read_image(tmp_path / "a.exr")
 

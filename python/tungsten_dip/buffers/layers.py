@@ -91,7 +91,7 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
             "the colour is luminance and chroma (Y, RY, BY): expected R, G, B; convert the image"
         )
     if "color" not in channels:
-        found = ", ".join(layers) or "nothing"
+        found = _listed(layers) or "nothing"
         raise InputError(f"no colour: expected R, G, B or layer color, found {found}; use --map color=LAYER")
     alpha = _alpha(channels["color"], names, layers, mapping)
     if alpha is not None:
@@ -173,8 +173,7 @@ def _mapped(key: str, value: str, names: list[str], layers: Layers) -> tuple[str
         return channels
     layer = next((layer for layer in layers if layer == value or layer.lower() == value.lower()), None)
     if layer is None:
-        present = (name or ", ".join(components.values()) for name, components in layers.items())
-        raise InputError(f"--map {key}={value}: no such layer or channel; there are {', '.join(present)}")
+        raise InputError(f"--map {key}={value}: no such layer or channel; there are {_listed(layers)}")
     ordered = _ordered(layers[layer])
     if not ordered:
         raise InputError(
@@ -182,6 +181,11 @@ def _mapped(key: str, value: str, names: list[str], layers: Layers) -> tuple[str
             f"{', '.join(layers[layer].values())}; name the channels, joined by commas"
         )
     return ordered
+
+
+def _listed(layers: Layers) -> str:
+    """Return the names of the layers, and of the channels at the top level."""
+    return ", ".join(name or ", ".join(components.values()) for name, components in layers.items())
 
 
 def _add_planes(

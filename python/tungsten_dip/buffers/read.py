@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,11 +46,11 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     path = Path(path)
     mapping = dict(mapping or {})
     if path.is_dir():
-        return _from_images(path, _files_of_folder(path, mapping))
+        return _from_images(path, *_files_of_folder(path, mapping))
     if path.suffix.lower() == ".json":
         if mapping:
             raise InputError(f"{path}: a scene names its buffers itself; use --map with a folder or an image")
-        return _from_images(path, _files_of_scene(path))
+        return _from_images(path, *_files_of_scene(path))
     source, attributes = _unwrapped(path, read_parts(path))
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
 
@@ -85,13 +85,14 @@ def input_files(path: str | Path, mapping: Mapping[str, str] | None = None) -> l
     """
     path = Path(path)
     if path.is_dir():
-        return list(_files_of_folder(path, dict(mapping or {})).values())
+        return list(_files_of_folder(path, dict(mapping or {}))[0].values())
     if path.suffix.lower() == ".json":
-        return [path, *_files_of_scene(path).values()]
+        return [path, *_files_of_scene(path)[0].values()]
     return [path]
 
 
-def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path]:
+def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> tuple[dict[str, Path], list[str]]:
+    """Return the file of every plane, and what is ignored."""
     try:
         present = sorted(file for file in folder.iterdir() if file.suffix.lower() in RADIANCE_SUFFIXES)
     except OSError as error:
@@ -120,24 +121,25 @@ def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> dict[str, Path
             f"{folder}: expected color.exr (.pfm, .hdr), found {_names(present)}; "
             "render with output_buffers, or use --map color=FILE"
         )
-    ignored = [file for file in present if file not in files.values()]
-    if ignored:
-        log.info("ignored: %s", _names(ignored))
-    return files
+    return files, [file.name for file in present if file not in files.values()]
 
 
-def _files_of_scene(path: Path) -> dict[str, Path]:
-    """The files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them."""
+def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
+    """Return the files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them.
+
+    Returns what is ignored as well.
+    """
     scene = object_from_json_file(path)
     try:
         renderer = scene.get("renderer", {})
         folder = path.parent / renderer.get("output_directory", "")
         requests = renderer.get("output_buffers", [])
         files: dict[str, Path] = {}
+        ignored = []
         for request in requests:
             quantity, name = request["type"], request.get("hdr_output_file")
             if quantity not in CHANNELS or not name:
-                log.info("ignored: output buffer %s without hdr_output_file or of unknown type", quantity)
+                ignored.append(f"output buffer {quantity} without hdr_output_file or of unknown type")
                 continue
             file = folder / name
             wanted = [""]
@@ -161,11 +163,13 @@ def _files_of_scene(path: Path) -> dict[str, Path]:
     missing = [file for file in files.values() if not file.is_file()]
     if missing:
         raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")
-    return files
+    return files, ignored
 
 
-def _from_images(path: Path, files: Mapping[str, Path]) -> RenderBuffers:
+def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) -> RenderBuffers:
     """Read one file per plane; each becomes a layer named as Tungsten names its file."""
+    if ignored:
+        log.info("ignored: %s", ", ".join(ignored))
     parts = {key: read_parts(file)[0] for key, file in files.items()}
     color = parts["color"]
     for key, part in parts.items():
