@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from moving_camera import write_frames
-from tungsten_dip.buffers import read_buffers, read_image
+from tungsten_dip.buffers import read_buffers, read_image, write_image
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.sequence import work
 
@@ -125,6 +125,30 @@ def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     assert "3 of 5 frames have no result: 1, 2, 4; the others are done" in error
     assert "Traceback" not in error
     assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
+
+
+@pytest.mark.parametrize("more", [(), ("--workers", "2")])
+def test_what_frames_were_taken_for_is_told_once(frames, capsys, more):
+    if more:
+        pytest.importorskip("distributed")
+    for number in range(COUNT):
+        write_image(f"noisy/f{number:04d}/nfor.exr", np.ones((2, 3, 3), np.float32))
+    Path("noisy/f0002/normalB.exr").unlink()
+    hole = read_image("noisy/f0003/color.exr").copy()
+    hole[1, 2] = np.nan
+    write_image("noisy/f0003/color.exr", hole)
+    assert main(arguments(*more)) == 0
+    lines = [re.sub(r"^tungsten-dip: ", "", line) for line in capsys.readouterr().err.splitlines()]
+    assert sum(line.endswith(" pixels") for line in lines) == 1
+    for told in (
+        "ignored: nfor.exr",
+        "color: mean color.RGB, half_a colorA.RGB, half_b colorB.RGB, variance colorVariance.RGB",
+        "normal: mean normal.RGB, half_a normalA.RGB, half_b normalB.RGB, variance normalVariance.RGB",
+        "normal: mean normal.RGB, half_a normalA.RGB, variance normalVariance.RGB",
+        "mended color 3 NaN",
+    ):
+        assert lines.count(told) == 1, told
+    assert sum(line.startswith("frame ") for line in lines) == COUNT
 
 
 def test_bad_options_are_one_line(frames, capsys):

@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.remarks import logging_to
 
 tqdm.get_lock()  # made on first use otherwise, which Ctrl-C must not cut short
 
@@ -199,16 +200,6 @@ def minutes(text: str) -> float:
     return duration(text, default_unit="m")
 
 
-@contextmanager
-def remarks_from_log() -> Iterator[list[str]]:
-    """Yield a list of what the library logs within the block, for the report."""
-    remarks: list[str] = []
-    handler = logging.Handler(logging.INFO)
-    handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
-    with _logging_to(handler):
-        yield remarks
-
-
 class _StderrHandler(logging.Handler):
     """Writes log lines above a progress bar, if one is being drawn."""
 
@@ -221,22 +212,8 @@ class _StderrHandler(logging.Handler):
 def _log_on_stderr(command: str) -> Iterator[None]:
     handler = _StderrHandler()
     handler.setFormatter(logging.Formatter(f"{command}: %(message)s"))
-    with _logging_to(handler):
+    with logging_to(handler):
         yield
-
-
-@contextmanager
-def _logging_to(handler: logging.Handler) -> Iterator[None]:
-    """Hand what the library logs at INFO and above to the handler, within the block alone."""
-    logger = logging.getLogger("tungsten_dip")
-    level = logger.level
-    logger.setLevel(logging.INFO)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
 
 
 def _message(error: Exception) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
@@ -36,6 +37,12 @@ log = logging.getLogger(__name__)
 
 TONEMAP = "gamma"
 """How the page shows frames: Tungsten's default."""
+
+
+_TOLD_OF_EVERY_FRAME = tuple(
+    f"tungsten_dip.{name}" for name in ("buffers", "fit", "onnx", "sequence.cluster")
+)
+"""The loggers of what is read and fitted, here or by workers."""
 
 
 def add_sequence(commands: _SubParsersAction[Any]) -> None:
@@ -80,8 +87,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         )
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
-    with _without_repetition():
-        check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
+    check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
     frames[0].output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(frames[0].output)
     if options.report is not None:
@@ -127,16 +133,25 @@ def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[P
 
 @contextmanager
 def _without_repetition() -> Iterator[None]:
-    """Keep back what would be told of every frame in the same words."""
-    loggers = [logging.getLogger(f"tungsten_dip.{name}") for name in ("buffers", "fit", "onnx")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.WARNING)
+    """Keep back what was told of an earlier frame in the same words."""
+    told: set[str] = set()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        if record.levelno > logging.INFO or not record.name.startswith(_TOLD_OF_EVERY_FRAME):
+            return True
+        words = re.sub(r"\d+", "", record.getMessage())  # numbers differ from frame to frame
+        seen = words in told
+        told.add(words)
+        return not seen
+
+    handlers = logging.getLogger("tungsten_dip").handlers
+    for handler in handlers:
+        handler.addFilter(is_new)
     try:
         yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        for handler in handlers:
+            handler.removeFilter(is_new)
 
 
 def _tell(record: Record) -> None:

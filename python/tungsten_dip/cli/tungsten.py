@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tungsten_dip
 from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
-from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, remarks_from_log, run
+from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     REPORT_HELP,
@@ -28,6 +28,7 @@ from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
+from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
 from tungsten_dip.scene.parse import load_scene

@@ -30,7 +30,6 @@ from tungsten_dip.cli.console import (
     integers,
     json_on_stdout,
     progress_on_stderr,
-    remarks_from_log,
     run,
 )
 from tungsten_dip.cli.denoising import (
@@ -48,6 +47,7 @@ from tungsten_dip.cli.denoising import (
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs, Preset
+from tungsten_dip.remarks import remarks_from_log
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
 

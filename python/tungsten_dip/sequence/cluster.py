@@ -19,9 +19,12 @@ from typing import Any
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress, silent
+from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.sequence.following import Follower, Models
 from tungsten_dip.sequence.frames import Frame
 from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
+
+_LOG = logging.getLogger(__name__)
 
 _LONGEST_TASK = 24
 """Frames; a task that is done again has to look at all of them."""
@@ -67,8 +70,10 @@ def denoise_on_cluster(
     shared = models or Models()
     if to_do:
         with _client(scheduler, workers) as client:
-            for done, found in _done(client, to_do, run, models):
+            for done, found, remarks in _done(client, to_do, run, models):
                 shared = found or shared
+                for remark in remarks:
+                    _LOG.info("%s", remark)
                 for record in done:
                     records.append(record)
                     tell(record)
@@ -78,8 +83,8 @@ def denoise_on_cluster(
 
 def _done(
     client: Any, frames: list[Frame], run: Run, models: Models | None
-) -> Iterator[tuple[list[Record], Models | None]]:
-    """Yield records as they come, the first frames' with their networks."""
+) -> Iterator[tuple[list[Record], Models | None, list[str]]]:
+    """Yield records as they come, the first frames' with their networks, and what the worker logged."""
     from distributed import as_completed
 
     count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
@@ -92,7 +97,7 @@ def _done(
         leads = [[frame] for frame in frames[:count]]
         length = 1
     group = f"frames-{os.urandom(4).hex()}"
-    tasks = {client.submit(denoise_frames, lead, run, models, pure=False): lead for lead in leads}
+    tasks = {client.submit(_denoise_frames, lead, run, models, pure=False): lead for lead in leads}
     first = next(iter(tasks))
     shared = client.submit(itemgetter(1), first, pure=False)
     rest = frames[sum(map(len, leads)) :]
@@ -100,16 +105,24 @@ def _done(
         part = rest[start : start + length]
         # Tasks whose keys say that they are alike wait at the scheduler until a worker is free.
         tasks[
-            client.submit(denoise_frames, part, run, shared, key=(group, start), pure=False, priority=-start)
+            client.submit(_denoise_frames, part, run, shared, key=(group, start), pure=False, priority=-start)
         ] = part
     for task in as_completed(tasks):
         if task.status == "finished":
-            records, found = task.result()
-            yield records, found if task is first else None
+            records, found, remarks = task.result()
+            yield records, found if task is first else None, remarks
         else:
             # Frames that it had finished by then are there.
             to_do, records = split_finished(tasks[task], run)
-            yield [*records, *(failed(frame, task.exception()) for frame in to_do)], None
+            yield [*records, *(failed(frame, task.exception()) for frame in to_do)], None, []
+
+
+def _denoise_frames(
+    frames: list[Frame], run: Run, models: Models | None
+) -> tuple[list[Record], Models, list[str]]:
+    """Return the records and networks of frames, and what was logged, which nobody would see on a worker."""
+    with remarks_from_log() as remarks:
+        return *denoise_frames(frames, run, models), remarks
 
 
 @contextmanager

@@ -1,0 +1,31 @@
+"""What the library logs, as a list: for reports, and from workers to whoever asked them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def remarks_from_log() -> Iterator[list[str]]:
+    """Yield a list of what the library logs within the block."""
+    remarks: list[str] = []
+    handler = logging.Handler(logging.INFO)
+    handler.emit = lambda record: remarks.append(record.getMessage())  # type: ignore[method-assign]
+    with logging_to(handler):
+        yield remarks
+
+
+@contextmanager
+def logging_to(handler: logging.Handler) -> Iterator[None]:
+    """Hand what the library logs at INFO and above to the handler, within the block alone."""
+    logger = logging.getLogger("tungsten_dip")
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
