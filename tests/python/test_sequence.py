@@ -15,7 +15,7 @@ from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
 from tungsten_dip.sequence.following import Follower, Models
-from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
 from tungsten_dip.sequence.reprojection import check_camera, reproject
 
 DRAFT = FitSettings(preset="draft", threads=1)
@@ -29,6 +29,11 @@ DRAFT = FitSettings(preset="draft", threads=1)
 )
 def test_numbers_are_read(text, numbers):
     assert numbers_from_text(text) == numbers
+    assert numbers_from_text(text_from_numbers(numbers)) == numbers
+
+
+def test_numbers_are_listed_as_ranges():
+    assert text_from_numbers([1, 3, 4, 5, 9, 10]) == "1, 3-5, 9-10"
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-3", "1,,2", "1-999999999", "1.5"])

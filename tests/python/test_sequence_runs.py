@@ -17,6 +17,8 @@ import pytest
 from moving_camera import write_frames
 from tungsten_dip.buffers import read_buffers, read_image, write_image
 from tungsten_dip.cli.tungsten_dip import main
+from tungsten_dip.fit.model import source_sha256
+from tungsten_dip.onnx import load_model
 from tungsten_dip.sequence import work
 
 COUNT = 4
@@ -122,7 +124,7 @@ def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     (frames / "cameras/f0002.json").unlink()
     assert main(arguments("--frames", "0-4")) == 2
     error = capsys.readouterr().err
-    assert "3 of 5 frames have no result: 1, 2, 4; the others are done" in error
+    assert "3 of 5 frames have no result: 1-2, 4; the others are done" in error
     assert "Traceback" not in error
     assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
 
@@ -210,9 +212,13 @@ def test_a_fit_cut_short_by_ctrl_c_is_not_saved(frames, monkeypatch):
     assert not outputs(frames)
 
 
-def test_the_first_network_is_saved_and_used(frames):
+def test_the_first_network_is_saved_and_used(frames, capfd):
     assert main(arguments("--frames", "0", "--save-model", "m.onnx")) == 0
+    assert capfd.readouterr().out.startswith("1 frame, ")
+    assert load_model("m.onnx").source_sha256 == source_sha256(read_buffers("noisy/f0000"))
     assert main(arguments("--frames", "1", "--warm-start", "m.onnx", "--refit", "0", "--json")) == 0
+    (frame,) = told(capfd)["frames"]
+    assert (frame["how"], frame["iterations"]) == ("followed", 0)
 
 
 # --- Several processes ---
@@ -325,7 +331,7 @@ def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatc
         n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
     ) as local:
         assert main(arguments("--scheduler", local.scheduler_address)) == 2
-    assert "3 of 4 frames have no result: 1, 2, 3; the others are done" in capsys.readouterr().err
+    assert "3 of 4 frames have no result: 1-3; the others are done" in capsys.readouterr().err
     assert list(outputs(frames)) == ["f0000.exr"]
 
 
@@ -343,6 +349,21 @@ def test_a_saved_model_is_that_of_the_first_frame_and_stays(frames, capsys):
     assert "frame 0 was finished before" in capsys.readouterr().err
     assert main(arguments("--save-model", "m.txt")) == 2
     assert "ends in .onnx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [(), ("--workers", "2")])
+def test_no_other_network_is_saved_in_place_of_the_first_frames(frames, capfd, more):
+    if more:
+        pytest.importorskip("distributed")
+    (frames / "noisy/f0000/color.exr").write_bytes(b"no image")
+    assert main(arguments("--save-model", "m.onnx", "--json", *more)) == 2
+    out, err = capfd.readouterr()
+    assert len(json.loads(out)["frames"]) == COUNT
+    assert err.splitlines()[-1].endswith(
+        "1 of 4 frames have no result: 0; the others are done; m.onnx: not written: frame 0, whose network "
+        "it is, has no result"
+    )
+    assert not Path("m.onnx").exists()
 
 
 def test_json_tells_of_the_frames_that_are_done_where_others_are_not(frames, capfd):

@@ -76,7 +76,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     with held_interrupts():
         from tungsten_dip.sequence.cluster import denoise_on_cluster
         from tungsten_dip.sequence.following import Models
-        from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+        from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
         from tungsten_dip.sequence.work import Run, denoise_frames
 
     if options.workers < 1:
@@ -109,19 +109,26 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
             )
     if options.report is not None:
         _write_report(options.report, options.input, records)
+    errors = []
+    failures = [record.number for record in records if record.error is not None]
+    if failures:
+        rest = "" if len(failures) == len(records) else "; the others are done"
+        listed = text_from_numbers(failures)
+        errors.append(f"{len(failures)} of {len(records)} frames have no result: {listed}{rest}")
     if options.save_model is not None:
-        _save_model(options.save_model, models, records[0])
+        try:
+            _save_model(options.save_model, models, records[0])
+        except InputError as error:
+            errors.append(str(error))
+    facts: dict[str, Any] = {"frames": [asdict(record) for record in records]}
+    if errors:
+        facts["error"] = "; ".join(errors)
     done = [record for record in records if not record.skipped and record.error is None]
     seconds = sum(record.seconds for record in done)
-    facts: dict[str, Any] = {"frames": [asdict(record) for record in records]}
-    failures = [record for record in records if record.error is not None]
-    if failures:
-        numbers_of = ", ".join(str(record.number) for record in failures)
-        rest = "" if len(failures) == len(records) else "; the others are done"
-        facts["error"] = f"{len(failures)} of {len(records)} frames have no result: {numbers_of}{rest}"
     skipped = sum(record.skipped for record in records)
-    before = f"; {skipped} were finished before" if skipped else ""
-    return facts, f"{len(done)} frames, denoised in {seconds:.1f} s in all{before}"
+    before = f"; {skipped} {'was' if skipped == 1 else 'were'} finished before" if skipped else ""
+    frame_or_frames = "frame" if len(done) == 1 else "frames"
+    return facts, f"{len(done)} {frame_or_frames}, denoised in {seconds:.1f} s in all{before}"
 
 
 def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[Path]:
@@ -170,6 +177,8 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
     """Save the network of the first frame, which other sequences may start from."""
     from tungsten_dip.onnx import save_model
 
+    if first.error is not None:
+        raise InputError(f"{path}: not written: frame {first.number}, whose network it is, has no result")
     if first.skipped:
         # What the first of the remaining frames left behind is another network.
         if not path.exists():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +40,17 @@ def numbers_from_text(text: str) -> tuple[int, ...]:
             raise InputError(f"frames {text}: expected numbers such as 1-100 or 1-3,7; mend '{part}'")
         numbers.update(range(first, last + 1))
     return tuple(sorted(numbers))
+
+
+def text_from_numbers(numbers: Iterable[int]) -> str:
+    """Return numbers in their order as ``1-3, 7``, which `numbers_from_text` reads."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ", ".join("-".join(map(str, run)) for run in runs)
 
 
 def find_frames(
