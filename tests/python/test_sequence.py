@@ -296,6 +296,12 @@ def test_followed_frames_have_few_pilots_of_their_own(tmp_path, preset, pilots):
     )
 
 
+@pytest.mark.parametrize("refit", [-1, "foo", 0.5, 10**9 + 1])
+def test_a_refit_that_cannot_be_done_is_named(refit):
+    with pytest.raises(InputError, match="refit: expected auto or a number from 0 to"):
+        Follower(DRAFT, refit)
+
+
 @pytest.mark.parametrize("refit", [0, 3])
 def test_refit_bounds_the_steps(tmp_path, refit):
     follower = Follower(DRAFT, refit)
@@ -406,7 +412,7 @@ def test_the_published_method_is_refused():
 
 @pytest.mark.filterwarnings("ignore:Specified provider")
 def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="iterations: expected a whole number"):
+    with pytest.raises(InputError, match="refit: expected auto or a number"):
         Follower(DRAFT, 2_000_000_000)
     if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
         with pytest.raises(InputError, match="device cuda"):

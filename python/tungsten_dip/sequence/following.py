@@ -34,6 +34,7 @@ _LOG = logging.getLogger(__name__)
 Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
+_MOST_REFIT = 10**9
 _MOST_STEPS = 240
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
@@ -81,8 +82,8 @@ class Follower:
         Raises InputError if the settings are those of the published method, which has no halves to follow,
         ask for another network than the first one's or a device that is not there, or refit is out of range.
         """
-        if isinstance(refit, int) and refit:
-            replace(settings, iterations=refit)  # which checks it
+        if refit != "auto" and not (isinstance(refit, int) and 0 <= refit <= _MOST_REFIT):
+            raise InputError(f"refit: expected auto or a number from 0 to {_MOST_REFIT}, got {refit!r:.40}")
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models or Models()
