@@ -12,6 +12,7 @@ import argparse
 import json
 import statistics
 import struct
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.render import QUANTITIES, render
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
@@ -150,6 +152,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Measure what each effect costs in time.")
     parser.add_argument("--repeats", type=int, default=5)
     repeats = parser.parse_args().repeats
+    if repeats < 1:
+        raise InputError(f"--repeats: expected 1 or more, got {repeats}")
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -184,4 +188,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as problem:
+        sys.exit(f"{sys.argv[0]}: {problem}")

@@ -1,4 +1,4 @@
-"""The scenes that benchmarks/scenes.py writes."""
+"""The scenes that benchmarks/scenes.py writes, and what the other scripts there refuse."""
 
 import subprocess
 import sys
@@ -8,12 +8,15 @@ import pytest
 
 from tungsten_dip.scene import load_scene
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "scenes.py"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 def write_scenes(folder, *options):
     return subprocess.run(
-        [sys.executable, SCRIPT, folder, *options], capture_output=True, text=True, check=False
+        [sys.executable, BENCHMARKS / "scenes.py", folder, *options],
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -33,3 +36,11 @@ def test_no_frames_are_refused_in_one_line(tmp_path, frames):
     assert result.stderr.endswith(f"--frames: expected a number above 0, got {frames}\n")
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "scenes").exists()
+
+
+def test_costs_of_no_repeats_are_refused_in_one_line():
+    script = [sys.executable, BENCHMARKS / "effect_costs.py", "--repeats", "0"]
+    result = subprocess.run(script, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr.endswith("effect_costs.py: --repeats: expected 1 or more, got 0\n")
+    assert result.stderr.count("\n") == 1
