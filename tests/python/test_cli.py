@@ -758,16 +758,17 @@ def test_buffers_are_not_written_over(folder, tmp_path, fits, capfd, plane):
     assert command.main(["denoise", str(single), "-o", str(single)]) == 0  # all layers are in the result
 
 
-def test_a_stdout_that_is_full_is_named(folder, tmp_path):
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_a_stdout_that_is_full_is_named(options, folder):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-c", MAIN.format("tungsten_dip"), "inspect", str(folder)],
+            [sys.executable, "-c", MAIN.format("tungsten_dip"), "inspect", str(folder), *options],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
         )
     assert done.returncode == 2
-    assert "stdout: cannot be written" in done.stderr
+    assert "stdout: cannot be written (No space left on device); the files are written" in done.stderr
 
 
 def test_ctrl_c_while_libraries_load_is_one_line():

@@ -64,10 +64,17 @@ def _run(arguments: Sequence[str] | None) -> None:
     options = _parser().parse_args(arguments)
     with json_on_stdout(options.json) as emit:
         facts, text = options.action(options)
-        if options.json:
-            emit(facts)
-        else:
-            _print(text)
+        try:
+            if options.json:
+                emit(facts)
+            else:
+                _print(text)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise InputError(
+                f"stdout: cannot be written ({error.strerror}); the files are written"
+            ) from error
     if "error" in facts:
         raise InputError(facts["error"])
     if facts.get("interrupted"):
@@ -76,13 +83,8 @@ def _run(arguments: Sequence[str] | None) -> None:
 
 def _print(text: str) -> None:
     encoding = sys.stdout.encoding or "utf-8"
-    try:
-        # Names of files need not be text.
-        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise InputError(f"stdout: cannot be written ({error.strerror}); the files are written") from error
+    # Names of files need not be text.
+    print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
