@@ -150,6 +150,17 @@ def test_the_commands_of_the_base_installation_do_without_torch(
     assert "psnr" in run("compare", out, tmp_path / "again.exr").lower()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "told"), [("--refit", "-1", "--refit: "), ("--threads", "0", "threads: ")]
+)
+def test_numbers_that_infer_cannot_take_are_told_before_anything_is_read(
+    option: str, value: str, told: str, saved: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["infer", str(saved), "missing", "-o", str(saved.parent / "out.exr"), option, value]
+    assert command.main(arguments) == 2
+    assert f"tungsten-dip: {told}expected" in capfd.readouterr().err
+
+
 def test_save_and_warm_start_on_the_command_line(
     tmp_path: Path, frame: SyntheticRender, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -166,7 +166,10 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    if options.refit < 0:
+        raise InputError(f"--refit: expected 0 or more steps, got {options.refit}")
     model = tungsten_dip.load_model(options.model)
+    replace(model.settings, threads=options.threads)  # which checks them, before anything is read
 
     def infer(buffers: RenderBuffers) -> FitResult:
         with progress_on_stderr("denoising") as progress:
