@@ -558,9 +558,9 @@ def test_the_picture_of_a_file_without_one_at_the_top_level_is_its_colour(tmp_pa
 
 
 def test_depth_of_three_different_channels(tmp_path: Path) -> None:
-    save(tmp_path / "a.exr", *"RGB", *rgb("depth"))
+    channels = save(tmp_path / "a.exr", *"RGB", *rgb("depth"))
     refused(tmp_path / "a.exr", "depth: expected 1 channels")
-    assert read_buffers(tmp_path / "a.exr", {"depth": "depth.R"}).depth is not None
+    assert holds(read_buffers(tmp_path / "a.exr", {"depth": "depth.R"}).depth, channels, "depth.R")
 
 
 NAME = st.text(string.ascii_letters + string.digits + "._- äß", min_size=1, max_size=12)

@@ -549,9 +549,17 @@ def test_glass_that_does_not_bend_shows_what_is_behind(folder: Path) -> None:
 
 
 def test_matrices_rounded_by_hand(folder: Path) -> None:
-    turned = [0.707, 0, 0.707, -5, 0, 1, 0, 1, -0.707, 0, 0.707, -5, 0, 0, 0, 1]
-    wall = [0.866, 0.5, 0.001, 0, -0.5, 0.866, 0, 0, 0, 0, 1.2, 0, 0, 0, 0, 1]
-    assert np.isfinite(rendered(folder, {**FLOOR, "transform": wall}, transform=turned).color.mean).all()
+    def picture(diagonal: float, cosine: float, skew: float) -> RenderBuffers:
+        turned = [diagonal, 0, diagonal, -1, 0, 1, 0, 0.4, -diagonal, 0, diagonal, -1, 0, 0, 0, 1]
+        wall = [cosine, 0.5, skew, 0, -0.5, cosine, 0, 0, 0, 0, 1.2, 0, 0, 0, 0, 1]
+        return rendered(folder, {**FLOOR, "transform": wall}, transform=turned, resolution=[16, 16])
+
+    rounded, exact = picture(0.707, 0.866, 0.001), picture(np.sqrt(0.5), np.sqrt(0.75), 0)
+    for name in ("color", "normal", "depth"):
+        of_rounded, of_exact = (getattr(buffers, name).mean for buffers in (rounded, exact))
+        np.testing.assert_allclose(of_rounded, of_exact, rtol=0.01, atol=0.01)
+    assert exact.depth is not None
+    assert np.count_nonzero(exact.depth.mean) > 10
 
 
 def test_a_sphere_without_one_axis_is_a_sphere(folder: Path) -> None:

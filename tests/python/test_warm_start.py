@@ -60,7 +60,7 @@ def test_a_warm_start_ends_when_the_error_falls_no_further(
     assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
 
 
-@pytest.mark.parametrize("by", ["torch", "onnxruntime"])
+@pytest.mark.parametrize("by", ["denoise", "infer"])
 def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
     by: str, model: Model, frame: SyntheticRender
 ) -> None:
@@ -68,7 +68,7 @@ def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
     assert albedo is not None
     light = Buffer(*(20 * plane for _, plane in albedo.planes()))
     unlike = frame.buffers.with_quantities(albedo=light)
-    if by == "torch":
+    if by == "denoise":
         result = denoise(unlike, replace(DRAFT, iterations=20), warm_start=model)
         # Only which pilot the others are compared with is the model's own.
         cold = denoise(unlike, replace(DRAFT, iterations=20))
