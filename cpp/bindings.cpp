@@ -215,8 +215,8 @@ NormAct norm_from_arrays(const Numbers& x, const Array& weight, const Array& bia
         bias.size() != x.shape(1)) {
         throw py::value_error("expected pixels of some channels, and as many weights and biases");
     }
-    return {.pixels = x.shape(0),
-            .channels = static_cast<int>(x.shape(1)),
+    return {.pixels = static_cast<std::size_t>(x.shape(0)),
+            .channels = static_cast<std::size_t>(x.shape(1)),
             .weight = weight.data(),
             .bias = bias.data(),
             .epsilon = epsilon,

@@ -169,8 +169,8 @@ using BFloat16 = std::uint16_t;  // the upper half of a float
 // Batch norm, with the statistics of the image in hand, and leaky ReLU of an image in bfloat16: `pixels` rows
 // of `channels` numbers, with a weight and a bias for each channel. For few channels PyTorch's own is slow.
 struct NormAct {
-    std::int64_t pixels = 0;
-    int channels = 0;
+    std::size_t pixels = 0;
+    std::size_t channels = 0;
     const float* weight = nullptr;
     const float* bias = nullptr;
     float epsilon = 0;  // added to the variance

@@ -13,10 +13,10 @@ namespace tungsten_dip {
 namespace {
 
 // Numbers are summed in chunks, and their sums in order: no result depends on the threads.
-constexpr std::int64_t chunk_numbers = 1 << 15;
+constexpr std::size_t chunk_numbers = 32768;
 
 // A loop goes over so many numbers at least, the channels several times: it fills the registers.
-constexpr int least_lanes = 64;
+constexpr std::size_t least_lanes = 64;
 
 using Sums = std::vector<std::vector<double>>;  // of each kind, for each channel
 
@@ -36,17 +36,17 @@ class Traversal {
   public:
     explicit Traversal(const NormAct& norm)
         : channels_(norm.channels),
-          lanes_(norm.channels * std::max(1, least_lanes / norm.channels)),
+          lanes_(norm.channels * std::max<std::size_t>(1, least_lanes / norm.channels)),
           numbers_(norm.pixels * norm.channels),
-          chunk_(std::max<std::int64_t>(chunk_numbers / lanes_, 1) * lanes_) {}
+          chunk_(std::max<std::size_t>(chunk_numbers / lanes_, 1) * lanes_) {}
 
-    [[nodiscard]] int lanes() const { return lanes_; }
+    [[nodiscard]] std::size_t lanes() const { return lanes_; }
 
     // One value for each lane, of one for each channel.
     template <typename Value>
     [[nodiscard]] std::vector<float> spread(const Value& of_channel) const {
         std::vector<float> values(lanes_);
-        for (int lane = 0; lane < lanes_; ++lane)
+        for (std::size_t lane = 0; lane < lanes_; ++lane)
             values[lane] = static_cast<float>(of_channel(lane % channels_));
         return values;
     }
@@ -54,18 +54,18 @@ class Traversal {
     // Calls body(first number, count) for every chunk, from several threads.
     template <typename Body>
     void for_chunks(int threads, const Body& body) const {
-        parallel_for(chunks(), threads, [&](int chunk) {
-            const std::int64_t first = chunk * chunk_;
+        parallel_for(static_cast<int>(chunks()), threads, [&](int chunk) {
+            const std::size_t first = static_cast<std::size_t>(chunk) * chunk_;
             body(first, std::min(numbers_ - first, chunk_));
         });
     }
 
     // Adds up what body(first number, count, sums) leaves in the lanes of `kinds` sums.
     template <typename Body>
-    [[nodiscard]] Sums sums(int kinds, int threads, const Body& body) const {
-        const std::ptrdiff_t size = static_cast<std::ptrdiff_t>(kinds) * lanes_;
+    [[nodiscard]] Sums sums(std::size_t kinds, int threads, const Body& body) const {
+        const std::size_t size = kinds * lanes_;
         std::vector<float> of_chunks(chunks() * size);
-        for_chunks(threads, [&](std::int64_t first, std::int64_t count) {
+        for_chunks(threads, [&](std::size_t first, std::size_t count) {
             body(first, count, of_chunks.data() + first / chunk_ * size);
         });
         Sums totals(kinds, std::vector<double>(channels_));
@@ -77,40 +77,41 @@ class Traversal {
     }
 
   private:
-    [[nodiscard]] int chunks() const { return static_cast<int>((numbers_ + chunk_ - 1) / chunk_); }
+    [[nodiscard]] std::size_t chunks() const { return (numbers_ + chunk_ - 1) / chunk_; }
 
-    int channels_;
-    int lanes_;
-    std::int64_t numbers_;
-    std::int64_t chunk_;
+    std::size_t channels_;
+    std::size_t lanes_;
+    std::size_t numbers_;
+    std::size_t chunk_;
 };
 
 // The loops below go over one chunk, a whole number of pixels.
 
-TUNGSTEN_DIP_FASTEST void add(const BFloat16* x, std::int64_t count, int lanes, float* __restrict sum) {
-    for (std::int64_t i = 0; i < count; i += lanes) {
-        const int width = static_cast<int>(std::min<std::int64_t>(lanes, count - i));
-        for (int lane = 0; lane < width; ++lane) sum[lane] += float_from(x[i + lane]);
+TUNGSTEN_DIP_FASTEST void add(const BFloat16* x, std::size_t count, std::size_t lanes,
+                              float* __restrict sum) {
+    for (std::size_t i = 0; i < count; i += lanes) {
+        const std::size_t width = std::min(lanes, count - i);
+        for (std::size_t lane = 0; lane < width; ++lane) sum[lane] += float_from(x[i + lane]);
     }
 }
 
-TUNGSTEN_DIP_FASTEST void add_squares(const BFloat16* x, std::int64_t count, int lanes, const float* mean,
-                                      float* __restrict sum) {
-    for (std::int64_t i = 0; i < count; i += lanes) {
-        const int width = static_cast<int>(std::min<std::int64_t>(lanes, count - i));
-        for (int lane = 0; lane < width; ++lane) {
+TUNGSTEN_DIP_FASTEST void add_squares(const BFloat16* x, std::size_t count, std::size_t lanes,
+                                      const float* mean, float* __restrict sum) {
+    for (std::size_t i = 0; i < count; i += lanes) {
+        const std::size_t width = std::min(lanes, count - i);
+        for (std::size_t lane = 0; lane < width; ++lane) {
             const float offset = float_from(x[i + lane]) - mean[lane];
             sum[lane] += offset * offset;
         }
     }
 }
 
-TUNGSTEN_DIP_FASTEST void write_output(const BFloat16* x, std::int64_t count, int lanes, const float* mean,
-                                       const float* factor, const float* bias, float slope,
+TUNGSTEN_DIP_FASTEST void write_output(const BFloat16* x, std::size_t count, std::size_t lanes,
+                                       const float* mean, const float* factor, const float* bias, float slope,
                                        BFloat16* __restrict y) {
-    for (std::int64_t i = 0; i < count; i += lanes) {
-        const int width = static_cast<int>(std::min<std::int64_t>(lanes, count - i));
-        for (int lane = 0; lane < width; ++lane) {
+    for (std::size_t i = 0; i < count; i += lanes) {
+        const std::size_t width = std::min(lanes, count - i);
+        for (std::size_t lane = 0; lane < width; ++lane) {
             const float normed = (float_from(x[i + lane]) - mean[lane]) * factor[lane] + bias[lane];
             y[i + lane] = bfloat16_from(normed > 0 ? normed : normed * slope);
         }
@@ -123,11 +124,11 @@ inline float before_relu(BFloat16 gradient, BFloat16 y, float slope) {
 }
 
 TUNGSTEN_DIP_FASTEST void add_gradients(const BFloat16* x, const BFloat16* y, const BFloat16* gradient,
-                                        std::int64_t count, int lanes, const float* mean, float slope,
+                                        std::size_t count, std::size_t lanes, const float* mean, float slope,
                                         float* __restrict sum, float* __restrict product) {
-    for (std::int64_t i = 0; i < count; i += lanes) {
-        const int width = static_cast<int>(std::min<std::int64_t>(lanes, count - i));
-        for (int lane = 0; lane < width; ++lane) {
+    for (std::size_t i = 0; i < count; i += lanes) {
+        const std::size_t width = std::min(lanes, count - i);
+        for (std::size_t lane = 0; lane < width; ++lane) {
             const float by_normed = before_relu(gradient[i + lane], y[i + lane], slope);
             sum[lane] += by_normed;
             product[lane] += by_normed * (float_from(x[i + lane]) - mean[lane]);
@@ -136,12 +137,12 @@ TUNGSTEN_DIP_FASTEST void add_gradients(const BFloat16* x, const BFloat16* y, co
 }
 
 TUNGSTEN_DIP_FASTEST void write_gradient(const BFloat16* x, const BFloat16* y, const BFloat16* gradient,
-                                         std::int64_t count, int lanes, const float* mean, float slope,
+                                         std::size_t count, std::size_t lanes, const float* mean, float slope,
                                          const float* factor, const float* constant, const float* linear,
                                          BFloat16* __restrict out) {
-    for (std::int64_t i = 0; i < count; i += lanes) {
-        const int width = static_cast<int>(std::min<std::int64_t>(lanes, count - i));
-        for (int lane = 0; lane < width; ++lane) {
+    for (std::size_t i = 0; i < count; i += lanes) {
+        const std::size_t width = std::min(lanes, count - i);
+        for (std::size_t lane = 0; lane < width; ++lane) {
             const float by_normed = before_relu(gradient[i + lane], y[i + lane], slope);
             const float offset = float_from(x[i + lane]) - mean[lane];
             out[i + lane] = bfloat16_from(by_normed * factor[lane] + constant[lane] + linear[lane] * offset);
@@ -153,22 +154,23 @@ TUNGSTEN_DIP_FASTEST void write_gradient(const BFloat16* x, const BFloat16* y, c
 
 void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale, int threads) {
     const Traversal traversal(norm);
-    const int lanes = traversal.lanes();
+    const std::size_t lanes = traversal.lanes();
     const auto pixels = static_cast<double>(norm.pixels);
-    const Sums sums = traversal.sums(1, threads, [&](std::int64_t first, std::int64_t count, float* sum) {
+    const Sums sums = traversal.sums(1, threads, [&](std::size_t first, std::size_t count, float* sum) {
         add(x + first, count, lanes, sum);
     });
-    for (int c = 0; c < norm.channels; ++c) mean[c] = static_cast<float>(sums[0][c] / pixels);
-    const std::vector<float> means = traversal.spread([&](int c) { return mean[c]; });
-    const Sums squares = traversal.sums(1, threads, [&](std::int64_t first, std::int64_t count, float* sum) {
+    for (std::size_t c = 0; c < norm.channels; ++c) mean[c] = static_cast<float>(sums[0][c] / pixels);
+    const std::vector<float> means = traversal.spread([&](std::size_t c) { return mean[c]; });
+    const Sums squares = traversal.sums(1, threads, [&](std::size_t first, std::size_t count, float* sum) {
         add_squares(x + first, count, lanes, means.data(), sum);
     });
-    for (int c = 0; c < norm.channels; ++c) {
+    for (std::size_t c = 0; c < norm.channels; ++c) {
         scale[c] = static_cast<float>(1 / std::sqrt(squares[0][c] / pixels + norm.epsilon));
     }
-    const std::vector<float> factors = traversal.spread([&](int c) { return norm.weight[c] * scale[c]; });
-    const std::vector<float> biases = traversal.spread([&](int c) { return norm.bias[c]; });
-    traversal.for_chunks(threads, [&](std::int64_t first, std::int64_t count) {
+    const std::vector<float> factors =
+        traversal.spread([&](std::size_t c) { return norm.weight[c] * scale[c]; });
+    const std::vector<float> biases = traversal.spread([&](std::size_t c) { return norm.bias[c]; });
+    traversal.for_chunks(threads, [&](std::size_t first, std::size_t count) {
         write_output(x + first, count, lanes, means.data(), factors.data(), biases.data(), norm.slope,
                      y + first);
     });
@@ -178,23 +180,23 @@ void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y
                        const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
                        float* by_bias, int threads) {
     const Traversal traversal(norm);
-    const int lanes = traversal.lanes();
+    const std::size_t lanes = traversal.lanes();
     const auto pixels = static_cast<double>(norm.pixels);
-    const std::vector<float> means = traversal.spread([&](int c) { return mean[c]; });
-    const Sums sums = traversal.sums(2, threads, [&](std::int64_t first, std::int64_t count, float* sum) {
+    const std::vector<float> means = traversal.spread([&](std::size_t c) { return mean[c]; });
+    const Sums sums = traversal.sums(2, threads, [&](std::size_t first, std::size_t count, float* sum) {
         add_gradients(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope, sum,
                       sum + lanes);
     });
-    for (int c = 0; c < norm.channels; ++c) {
+    for (std::size_t c = 0; c < norm.channels; ++c) {
         by_bias[c] = static_cast<float>(sums[0][c]);
         by_weight[c] = static_cast<float>(sums[1][c] * scale[c]);
     }
-    const auto factor = [&](int c) { return static_cast<double>(norm.weight[c]) * scale[c]; };
+    const auto factor = [&](std::size_t c) { return static_cast<double>(norm.weight[c]) * scale[c]; };
     const auto factors = traversal.spread(factor);
-    const auto constants = traversal.spread([&](int c) { return -factor(c) * sums[0][c] / pixels; });
-    const auto linears =
-        traversal.spread([&](int c) { return -factor(c) * scale[c] * scale[c] * sums[1][c] / pixels; });
-    traversal.for_chunks(threads, [&](std::int64_t first, std::int64_t count) {
+    const auto constants = traversal.spread([&](std::size_t c) { return -factor(c) * sums[0][c] / pixels; });
+    const auto linears = traversal.spread(
+        [&](std::size_t c) { return -factor(c) * scale[c] * scale[c] * sums[1][c] / pixels; });
+    traversal.for_chunks(threads, [&](std::size_t first, std::size_t count) {
         write_gradient(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope,
                        factors.data(), constants.data(), linears.data(), by_x + first);
     });

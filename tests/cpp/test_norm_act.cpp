@@ -1,10 +1,10 @@
-// Batch norm and leaky ReLU against their definition in double precision, gradients against differences.
+// Batch norm and leaky ReLU: against their definition in double precision, gradients against differences.
 #include <algorithm>
-#include <array>
 #include <bit>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <type_traits>
 #include <vector>
 
 #include "check.hpp"
@@ -20,96 +20,117 @@ constexpr float slope = 0.2F;
 
 double value_of(BFloat16 bits) { return std::bit_cast<float>(static_cast<std::uint32_t>(bits) << 16U); }
 
-std::vector<BFloat16> bits_of(const Pixels& image) {
+std::vector<BFloat16> random_bits(Size size, int channels, unsigned seed) {
     std::vector<BFloat16> bits;
-    for (const float value : image.values)
+    for (const float value : noise(size, channels, seed, 3).values)
         bits.push_back(static_cast<BFloat16>(std::bit_cast<std::uint32_t>(value) >> 16U));
     return bits;
 }
 
-struct Image8 {
-    std::vector<BFloat16> x, gradient;
-    std::vector<float> weight, bias;
-    NormAct norm;
+// An image, what came of it, and a loss: the sum of the outputs times `gradient`.
+struct Example {
+    std::size_t channels;
+    std::vector<BFloat16> x;
+    std::vector<BFloat16> gradient;
+    std::vector<float> weight;
+    std::vector<float> bias;
+    std::vector<BFloat16> y;
+    std::vector<float> mean;
+    std::vector<float> scale;
 
-    Image8(int height, int width, int channels)
-        : x(bits_of(noise({height, width}, channels, 1, 3))),
-          gradient(bits_of(noise({height, width}, channels, 2))) {
-        for (int c = 0; c < channels; ++c) {
-            weight.push_back(0.5F + 0.1F * static_cast<float>(c));
-            bias.push_back(0.3F * static_cast<float>(c % 3 - 1));
-        }
-        norm = {height * width, channels, weight.data(), bias.data(), epsilon, slope};
+    Example(Size size, int channel_count)
+        : channels(static_cast<std::size_t>(channel_count)),
+          x(random_bits(size, channel_count, 1)),
+          gradient(random_bits(size, channel_count, 2)),
+          weight(noise({.height = 1, .width = 1}, channel_count, 3).values),
+          bias(noise({.height = 1, .width = 1}, channel_count, 4).values),
+          y(x.size()),
+          mean(channels),
+          scale(channels) {}
+
+    [[nodiscard]] NormAct norm() const {
+        return {.pixels = x.size() / channels,
+                .channels = channels,
+                .weight = weight.data(),
+                .bias = bias.data(),
+                .epsilon = epsilon,
+                .slope = slope};
     }
+    void run(int threads) { norm_act(norm(), x.data(), y.data(), mean.data(), scale.data(), threads); }
 };
 
-// The loss is the sum of the outputs times `gradient`; returns it and the outputs.
-double loss(const Image8& image, const std::vector<double>& x, std::vector<double>& y) {
-    const auto channels = static_cast<std::size_t>(image.norm.channels);
-    const auto pixels = x.size() / channels;
+double loss(const Example& example, const std::vector<double>& x, std::vector<double>& y) {
+    const std::size_t channels = example.channels;
+    const double pixels = static_cast<double>(x.size()) / static_cast<double>(channels);
     double sum = 0;
     for (std::size_t c = 0; c < channels; ++c) {
         double mean = 0;
         double variance = 0;
-        for (std::size_t p = 0; p < pixels; ++p) mean += x[p * channels + c] / static_cast<double>(pixels);
-        for (std::size_t p = 0; p < pixels; ++p)
-            variance += std::pow(x[p * channels + c] - mean, 2) / static_cast<double>(pixels);
-        for (std::size_t p = 0; p < pixels; ++p) {
-            const std::size_t i = p * channels + c;
+        for (std::size_t i = c; i < x.size(); i += channels) mean += x[i] / pixels;
+        for (std::size_t i = c; i < x.size(); i += channels) variance += std::pow(x[i] - mean, 2) / pixels;
+        for (std::size_t i = c; i < x.size(); i += channels) {
             const double normed =
-                (x[i] - mean) / std::sqrt(variance + epsilon) * image.weight[c] + image.bias[c];
+                (x[i] - mean) / std::sqrt(variance + epsilon) * example.weight[c] + example.bias[c];
             y[i] = normed > 0 ? normed : slope * normed;
-            sum += y[i] * value_of(image.gradient[i]);
+            sum += y[i] * value_of(example.gradient[i]);
         }
     }
     return sum;
 }
 
-void values_and_gradients_are_those_of_the_definition() {
-    for (const auto& [height, width, channels] :
-         {std::array{1, 2, 1}, std::array{5, 7, 3}, std::array{6, 4, 8}, std::array{3, 3, 70}}) {
-        const Image8 image(height, width, channels);
-        std::vector<BFloat16> y(image.x.size());
-        std::vector<BFloat16> by_x(image.x.size());
-        std::vector<float> mean(channels), scale(channels), by_weight(channels), by_bias(channels);
-        norm_act(image.norm, image.x.data(), y.data(), mean.data(), scale.data(), 2);
-        norm_act_gradient(image.norm, image.x.data(), y.data(), mean.data(), scale.data(),
-                          image.gradient.data(), by_x.data(), by_weight.data(), by_bias.data(), 2);
+void values_and_gradients_are_those_of_the_definition(Size size, int channels) {
+    Example example(size, channels);
+    example.run(2);
+    std::vector<BFloat16> by_x(example.x.size());
+    std::vector<float> by_weight(example.channels);
+    std::vector<float> by_bias(example.channels);
+    norm_act_gradient(example.norm(), example.x.data(), example.y.data(), example.mean.data(),
+                      example.scale.data(), example.gradient.data(), by_x.data(), by_weight.data(),
+                      by_bias.data(), 2);
 
-        std::vector<double> x;
-        for (const BFloat16 bits : image.x) x.push_back(value_of(bits));
-        std::vector<double> expected(x.size());
-        std::vector<double> unused(x.size());
-        loss(image, x, expected);
-        for (std::size_t i = 0; i < x.size(); ++i) {
-            CHECK(near(value_of(y[i]), expected[i], 1e-5 + std::abs(expected[i]) / 256));
-            constexpr double step = 1e-5;
-            const double before = x[i];
-            x[i] = before + step;
-            const double above = loss(image, x, unused);
-            x[i] = before - step;
-            const double slope_here = (above - loss(image, x, unused)) / (2 * step);
-            x[i] = before;
-            CHECK(near(value_of(by_x[i]), slope_here, 1e-4 + std::abs(slope_here) / 128));
-        }
+    std::vector<double> x(example.x.size());
+    std::ranges::transform(example.x, x.begin(), value_of);
+    std::vector<double> expected(x.size());
+    std::vector<double> unused(x.size());
+    loss(example, x, expected);
+    const auto difference = [&](auto& variable, double step) {
+        const auto before = variable;
+        variable = static_cast<std::remove_reference_t<decltype(variable)>>(before + step);
+        const double above = loss(example, x, unused);
+        variable = static_cast<std::remove_reference_t<decltype(variable)>>(before - step);
+        const double below = loss(example, x, unused);
+        variable = before;
+        return (above - below) / (2 * step);
+    };
+    for (std::size_t i = 0; i < x.size(); ++i) {
+        CHECK(near(value_of(example.y[i]), expected[i], 1e-5 + std::abs(expected[i]) / 256));
+        const double by_this = difference(x[i], 1e-5);
+        CHECK(near(value_of(by_x[i]), by_this, 1e-3 + std::abs(by_this) / 128));
+    }
+    constexpr double step = 1. / 65536;  // which a float of this size can take
+    for (std::size_t c = 0; c < example.channels; ++c) {
+        CHECK(near(by_weight[c], difference(example.weight[c], step), 0.01));
+        CHECK(near(by_bias[c], difference(example.bias[c], step), 0.01));
     }
 }
 
 void threads_make_no_difference() {
-    const Image8 image(90, 101, 8);  // several chunks
-    std::vector<BFloat16> first(image.x.size());
-    std::vector<BFloat16> second(image.x.size());
-    std::vector<float> moments(16), others(16);
-    norm_act(image.norm, image.x.data(), first.data(), moments.data(), moments.data() + 8, 1);
-    norm_act(image.norm, image.x.data(), second.data(), others.data(), others.data() + 8, 5);
-    CHECK(first == second);
-    CHECK(moments == others);
+    Example one({.height = 90, .width = 101}, 8);  // several chunks
+    Example many = one;
+    one.run(1);
+    many.run(5);
+    CHECK(one.y == many.y);
+    CHECK(one.mean == many.mean);
+    CHECK(one.scale == many.scale);
 }
 
 }  // namespace
 
 int main() {
-    values_and_gradients_are_those_of_the_definition();
+    values_and_gradients_are_those_of_the_definition({.height = 1, .width = 2}, 1);
+    values_and_gradients_are_those_of_the_definition({.height = 5, .width = 7}, 3);
+    values_and_gradients_are_those_of_the_definition({.height = 6, .width = 4}, 8);
+    values_and_gradients_are_those_of_the_definition({.height = 3, .width = 3}, 70);
     threads_make_no_difference();
     return failed_checks();
 }
