@@ -7,9 +7,9 @@ torch = pytest.importorskip("torch")
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
-from tungsten_dip.fit import denoise, paper  # noqa: E402
-from tungsten_dip.fit.inputs import ldr_from_radiance, paper_images, radiance_from_ldr  # noqa: E402
-from tungsten_dip.fit.paper import INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
+from tungsten_dip.fit import denoise  # noqa: E402
+from tungsten_dip.fit.published.fit import BACKTRACK_DB, INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
+from tungsten_dip.fit.published.images import ldr_from_radiance, paper_images, radiance_from_ldr  # noqa: E402
 from tungsten_dip.fit.settings import FitSettings  # noqa: E402
 from tungsten_dip.progress import silent  # noqa: E402
 
@@ -168,7 +168,7 @@ def test_backtracks_when_the_output_gets_much_worse():
         for weight in fit.network.parameters():
             weight.mul_(-3)
     fit.step()
-    assert fit.psnr < good_psnr - paper.BACKTRACK_DB
+    assert fit.psnr < good_psnr - BACKTRACK_DB
     assert torch.equal(
         torch.cat(
             [
@@ -179,7 +179,7 @@ def test_backtracks_when_the_output_gets_much_worse():
         good,
     )
     fit.step()
-    assert fit.psnr > good_psnr - paper.BACKTRACK_DB
+    assert fit.psnr > good_psnr - BACKTRACK_DB
 
 
 def test_backtracks_from_nan():

@@ -17,7 +17,7 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import require_torch
 from tungsten_dip.fit.oidn import Quality, oidn_image, require_oidn
-from tungsten_dip.fit.published import ITERATIONS
+from tungsten_dip.fit.published.constants import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.progress import Progress
 

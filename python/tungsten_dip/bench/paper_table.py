@@ -22,9 +22,9 @@ from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.inputs import paper_images
 from tungsten_dip.fit.preparation import prepared
-from tungsten_dip.fit.published import ITERATIONS
+from tungsten_dip.fit.published.constants import ITERATIONS
+from tungsten_dip.fit.published.images import paper_images
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 

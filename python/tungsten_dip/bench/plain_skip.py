@@ -12,14 +12,14 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from tungsten_dip.fit.paper import (
+from tungsten_dip.fit.published.constants import LEAKY_SLOPE
+from tungsten_dip.fit.published.fit import (
     AVERAGE_WEIGHT,
     BACKTRACK_DB,
     INPUT_NOISE_STD,
     LEARNING_RATE,
     learning_rate,
 )
-from tungsten_dip.fit.published import LEAKY_SLOPE
 
 
 class PlainSkip(nn.Module):

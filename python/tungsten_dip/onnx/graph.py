@@ -1,4 +1,4 @@
-"""The graphs of the networks: what `fit.pointwise` and `fit.networks` compute, in plain operators.
+"""The graphs of the networks: what `fit.pointwise` and `fit.published.networks` compute, in plain operators.
 
 The height and width of the inputs are free. A batch holds images that know nothing of one another: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
@@ -18,7 +18,7 @@ from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.planes import LARGEST_INPUT
 from tungsten_dip.fit.pointwise import HIDDEN
 from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
-from tungsten_dip.fit.published import (
+from tungsten_dip.fit.published.constants import (
     LEAKY_SLOPE,
     NORM_EPSILON,
     RESNET_BLOCKS,
@@ -98,7 +98,7 @@ class _Network(GraphBuilder):
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
     def skip(self, planes: int, outputs: int, channels: tuple[int, ...]) -> None:
-        """Encoder and decoder, as `tungsten_dip.fit.networks.Skip` with its defaults."""
+        """Encoder and decoder, as `tungsten_dip.fit.published.networks.Skip` with its defaults."""
         scales = len(channels)
         sources, deeper = (planes, *channels[:-1]), (*channels[1:], channels[-1])
         x = self.mirrored("inputs", 2**scales, at_least=2 ** (scales + 1))
@@ -138,7 +138,7 @@ class _Network(GraphBuilder):
         self.cropped(self.add("Sigmoid", self.conv(x, "head", channels[0], outputs)))
 
     def resnet(self, planes: int, outputs: int) -> None:
-        """Residual blocks, as `tungsten_dip.fit.networks.ResNet` with its defaults."""
+        """Residual blocks, as `tungsten_dip.fit.published.networks.ResNet` with its defaults."""
         width = RESNET_WIDTH
         x = self.padded(self.mirrored("inputs", 1, at_least=2), "reflect")
         x = self.leaky(self.conv(x, "first", planes, width, size=3))
@@ -199,7 +199,7 @@ class _Network(GraphBuilder):
         return self.add("Pad", x, self.integers(0, 0, 1, 1, 0, 0, 1, 1), mode=mode)
 
     def mirrored(self, x: str, multiple: int, at_least: int) -> str:
-        """Continue below and to the right, as `tungsten_dip.fit.networks.mirror_to_multiple`."""
+        """Continue below and to the right, as `tungsten_dip.fit.published.networks.mirror_to_multiple`."""
         one = self.integers(1)
         for axis in (2, 3):
             size = self.add("Shape", x, start=axis, end=axis + 1)

@@ -14,11 +14,11 @@ from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.halves import of_both_halves
-from tungsten_dip.fit.inputs import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.model import Model, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import finished, prepared
+from tungsten_dip.fit.published.images import network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto

@@ -1,4 +1,4 @@
-"""What the published method shows its network and asks of it: images in [0, 1], as Tungsten's PNGs hold them.
+"""Inputs and training targets of the published method: images in [0, 1], as in Tungsten's PNGs.
 
 Tungsten writes (`OutputBuffer::saveLdr`) normals as (n + 1) / 2, depth divided by its largest value, albedo
 and every variance as they are, all clipped to [0, 1]. Grey images are read as three equal channels. Here

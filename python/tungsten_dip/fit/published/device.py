@@ -1,4 +1,4 @@
-"""Where torch computes: the device of a fit and its threads."""
+"""The device that torch computes on, its number of threads and its precision."""
 
 from __future__ import annotations
 

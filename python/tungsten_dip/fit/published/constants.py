@@ -1,4 +1,4 @@
-"""Numbers of the published method that are asked for where torch is not: by graphs, commands and tables.
+"""Constants of the published method, also for code without torch: ONNX graphs, commands and tables.
 
 From the published code; ``docs/method.md`` states the method whole.
 """
