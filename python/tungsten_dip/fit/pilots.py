@@ -1,13 +1,14 @@
-"""Pilots: closed-form guesses at the clean image, among which a network later chooses pixel by pixel.
+"""Pilots: closed-form estimates of the clean image, among which a network later chooses pixel by pixel.
 
 A pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
-window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`), or it sees the
-colour alone. Each half of the samples is denoised from its own samples alone: what one half's pilots predict
-is scored by the other half, whose noise they have never seen.
+window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`), or it uses the
+colour alone. Each half is denoised from its own samples alone, so that the noise of the other half, which
+scores its pilots, is independent of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,9 +19,9 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 
-# Features are scaled so that one unit is a difference which separates two surfaces; these penalties of
-# squared differences stand for normals 35 degrees apart, albedos 0.2 apart and depths a tenth of the scene's
-# apart.
+# Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
+# degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
+# far away.
 _NORMAL_PENALTY = 3.0
 _ALBEDO_PENALTY = 20.0
 _DEPTH_PENALTY = 5.0
@@ -31,13 +32,14 @@ _LEAST_ALBEDO = 0.01
 """Added to the albedo that divides the colour, so that dark surfaces keep their noise finite."""
 
 _BLACK_ALBEDO = 1e-3
-"""Below it a surface's colour cannot come from its albedo (a specular one, say) and is not divided by it."""
+"""Below it a surface's colour (a mirror's, say) does not come from its albedo and is not divided by it."""
 
 _BRIGHTEST_ALBEDO = 1e6
-"""Brighter light, in the renderer's units, looks the same to the regression."""
+"""The regression does not distinguish brighter emission, in the renderer's units."""
 
 _GUIDE_OFFSET = 0.05
-"""Guides are compared as log(radiance + offset), where the eye stops to see noise as relative."""
+"""Guides are log(irradiance + offset), of radiance for `Pilot.by_color`: far below the offset, what is visible
+is the absolute difference, not the relative one."""
 
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
@@ -50,21 +52,22 @@ _CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 
 _STRAY = 4.0
 _STRAY_RADIUS = 2
-"""Emission of one half so many times what the other half saw in the 5x5 pixels around was seen by chance."""
+"""Emission of one half more than so many times the sum over the other half's 5x5 pixels was hit by chance."""
 
 _SAMPLES_OF_GUIDE = 12
-"""About how many independent pixels a guide of all samples averages: its noise, which no second half tells,
-is that of the image divided by this."""
+"""About how many independent pixels a guide of all samples averages: no second half is left to estimate its
+noise, which is taken to be that of the image divided by this."""
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """One window of regression. ``k`` None: neighbours are weighed by features alone, not by a guide.
+    """One window of regression, ``radius`` and ``step`` in pixels.
 
-    ``along_edges``: no regression, but the mean along the edges of the features, with the standard deviation
-    ``radius``. It shows how much of a pixel each surface covers better than the samples in the pixel do.
-    ``by_color``: without features and albedo, which on mirrors, in glass and out of focus are as noisy as the
-    colour.
+    ``k`` is the damping of non-local means by a guide; None: neighbours are weighted by features alone.
+    ``with_position``: the pixel's position is a further feature. ``along_edges``: no regression, but the mean
+    along the edges of the features, with the standard deviation ``radius``. It estimates how much of a pixel
+    each surface covers better than the samples in the pixel do. ``by_color``: without features and albedo,
+    which on mirrors, in glass and out of focus are as noisy as the colour.
     """
 
     radius: int
@@ -77,12 +80,12 @@ class Pilot:
 
 FIRST_GUIDE = Pilot(radius=3)
 FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
-"""Where no feature shows an edge, a window blurs every one within it."""
+"""Without features, a window blurs every edge within it."""
 
 EDGES = Pilot(6, along_edges=True)
 
-# In order of cost. Small windows keep detail, large ones even out what remains of the noise; guided ones keep
-# shadows and reflections, which no feature shows; a regression on the position follows gradients.
+# In order of cost. Small windows keep detail, large ones average out the remaining noise; guided ones keep
+# shadows and reflections, which no feature contains; a regression on the position follows gradients.
 DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
 BALANCED_PILOTS = (
     Pilot(1),
@@ -102,7 +105,7 @@ FINAL_PILOTS = (
     Pilot(32, k=2.0, step=4, with_position=True),
 )
 
-# Enough beside what the previous frame shows. The first stands where that shows nothing.
+# Enough beside the previous frame. The first replaces it where it has no value.
 FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(8, step=4, with_position=True))
 FOLLOWING_PILOTS = (
     Pilot(1),
@@ -115,13 +118,14 @@ FOLLOWING_PILOTS = (
 
 @dataclass(frozen=True)
 class Guidance:
-    """What all pilots of one half share: features to regress on, and what parts the colour from its surface.
+    """What all pilots of one half share: the features to regress on, and how the colour is demodulated.
 
-    ``features`` has shape (height, width, n), noise-reduced, scaled, without those that are the same in
-    every pixel, called ``names``; ``penalty`` one value for each. ``left_out`` holds the value of each of the
-    others. ``albedo``, shape (height, width, 3), divides the colour and is never 0. ``emission`` is the
-    radiance that the half's own samples saw lights emit, which is taken from the colour before,
-    ``smooth_emission`` what is given back. ``edges`` is the features' structure tensor.
+    ``features`` (height, width, n) are pre-filtered and scaled, with one of ``names`` and one ``penalty``
+    each. Features that are the same in every pixel are not among them; ``left_out`` maps their names to their
+    values. ``albedo`` (height, width, 3), never 0, divides the colour. ``emission`` (height, width, 3) is the
+    radiance emitted towards the half's own samples, which is subtracted before, and ``smooth_emission`` the
+    denoised one that is added back, both linear and in the units of `evidence.Evidence`. ``edges``, shape
+    (height, width, 3), is the features' structure tensor.
     """
 
     features: FloatImage
@@ -135,21 +139,22 @@ class Guidance:
     threads: int
 
     def irradiance(self, color: FloatImage) -> FloatImage:
-        """Return what falls on the surfaces that a half shows in ``color``."""
+        """Return the irradiance (colour without emission, divided by albedo) of a noisy half ``color``."""
         irradiance: FloatImage = (color - self.emission) / self.albedo
         return irradiance
 
     def color(self, irradiance: FloatImage) -> FloatImage:
-        """Return the radiance, never negative, that surfaces and lights send back."""
+        """Return the radiance, never negative, of surfaces under this irradiance and of lights."""
         color: FloatImage = np.maximum(irradiance, 0) * self.albedo + self.smooth_emission
         return color
 
 
 @dataclass(frozen=True)
 class Guides:
-    """What the guided pilots compare: ``images``, log radiance, one for each half or for the mean.
+    """What guided pilots compare and denoise, one image for each half or for the mean, (height, width, 3).
 
-    ``noise`` is the variance of one of them, shape (height, width, 3), ``irradiances`` what is smoothed.
+    ``images`` are smoothed log irradiance, or log radiance for pilots ``by_color``. ``noise`` is the variance
+    of one of them, ``irradiances`` the noisy irradiance (or radiance) that is regressed.
     """
 
     images: tuple[FloatImage, ...]
@@ -162,74 +167,107 @@ def guidance_of_halves(
 ) -> tuple[Guidance, ...]:
     """Pre-filter, scale and select the features of sanitised buffers; return the guidance of every colour.
 
-    ``colors`` are the two halves, or the mean alone, in the renderer's units times ``scale``. What guides a
-    half is made of its own samples alone (the other half only says which of them to average), since errors
-    that a half's features share with the colour that scores them would pass for truth.
+    ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
+    shape (height, width, 3). The guidance of a half is computed from its own samples alone (the other half
+    only determines which of them are averaged), since errors that a half's features share with the colour
+    that scores them would be mistaken for signal.
     """
-    shown = tuple(color / np.float32(scale) for color in colors)
+    count = len(colors)
     albedos: tuple[FloatImage, ...] = ()
     if buffers.albedo is not None:
-        given = _without_stray_emission(buffers.albedo, threads)
-        # Above 1 it is light that a surface emits, which the colour must show too. What the colour does not
-        # show is a wild value, and would be smeared over its surroundings.
-        albedos = tuple(
-            np.minimum(albedo, 1 + np.maximum(color, 0))
-            for albedo, color in zip(_planes(given, len(colors)), shown, strict=True)
-        )
-        if given.halves is not None and len(colors) == 2:
-            a, b = albedos
-            bounded = Buffer(np.float32(0.5) * (a + b), a, b, given.variance)
-        else:
-            bounded = replace(given, mean=albedos[0])
-        buffers = replace(buffers, albedo=bounded)
+        rendered = _without_stray_emission(buffers.albedo, threads)
+        albedos = _bounded_albedos(rendered, colors, scale)
+        buffers = replace(buffers, albedo=_with_planes(rendered, albedos))
     filtered = prefilter_features(buffers, threads)
-    depth_scale = 1.0
-    if filtered.depth is not None:
-        hit = filtered.depth.mean[filtered.depth.mean > 0]
-        depth_scale = float(np.median(hit)) if hit.size else 1.0
-
-    planes_of_halves = [
-        _feature_planes(filtered, half, len(colors), depth_scale) for half in range(len(colors))
+    depth_scale = _depth_scale(filtered)
+    planes_of_colors = [_feature_planes(filtered, index, count, depth_scale) for index in range(count)]
+    flat = [
+        name
+        for name in planes_of_colors[0]
+        if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_colors)
     ]
-    names = tuple(planes_of_halves[0])
-    flat = [name for name in names if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_halves)]
-    kept = tuple(name for name in names if name not in flat)
-    guidance = []
-    for half, planes in enumerate(planes_of_halves):
-        features = np.empty((*shown[half].shape[:2], len(kept)), np.float32)
-        for index, name in enumerate(kept):
-            features[:, :, index] = planes[name][0]
-        penalty = tuple(planes[name][1] for name in kept)
-        edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
-        albedo = np.ones(shown[half].shape, np.float32)
-        emission = smooth_emission = np.zeros(shown[half].shape, np.float32)
-        if filtered.albedo is not None:
-            smooth = _planes(filtered.albedo, len(colors))[half]
-            albedo = divisor(np.clip(smooth, 0, 1))
-            emission = np.maximum(albedos[half] - 1, 0) * np.float32(scale)
-            smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
-            if emission.any():
-                smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
-        left_out = {name: float(planes[name][0][0, 0]) for name in flat}
-        guidance.append(
-            Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
-        )
-    return tuple(guidance)
+    surfaces: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
+    if filtered.albedo is not None:
+        surfaces = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
+    return tuple(
+        _guidance(planes, flat, surface, color.shape, scale, threads)
+        for planes, surface, color in zip(planes_of_colors, surfaces, colors, strict=True)
+    )
+
+
+def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: float) -> tuple[FloatImage, ...]:
+    """Return the albedo for every colour, bounded by 1 plus the radiance of that colour.
+
+    Above 1 it is emitted light, which the colour must contain too. What the colour does not contain is an
+    outlier, and would be smeared over its surroundings.
+    """
+    return tuple(
+        np.minimum(plane, 1 + np.maximum(color / np.float32(scale), 0))
+        for plane, color in zip(_planes(albedo, len(colors)), colors, strict=True)
+    )
+
+
+def _with_planes(feature: Buffer, planes: tuple[FloatImage, ...]) -> Buffer:
+    """Replace the halves of a feature or, of one without halves or for one colour, the mean."""
+    if feature.halves is None or len(planes) == 1:
+        return replace(feature, mean=planes[0])
+    a, b = planes
+    return Buffer(np.float32(0.5) * (a + b), a, b, feature.variance)
+
+
+def _depth_scale(filtered: RenderBuffers) -> float:
+    """Return the median depth of the pixels that hit a surface; 1 if none did."""
+    if filtered.depth is None:
+        return 1.0
+    hit = filtered.depth.mean[filtered.depth.mean > 0]
+    return float(np.median(hit)) if hit.size else 1.0
+
+
+def _guidance(
+    planes: dict[str, tuple[FloatImage, float]],
+    flat: Sequence[str],
+    albedos: tuple[FloatImage, FloatImage] | None,
+    shape: tuple[int, ...],
+    scale: float,
+    threads: int,
+) -> Guidance:
+    """Return the guidance of one colour of this shape.
+
+    ``planes`` are those of `_feature_planes`, of which those named by ``flat`` are left out. ``albedos`` is
+    the albedo before and after pre-filtering, if there is one.
+    """
+    kept = tuple(name for name in planes if name not in flat)
+    features = np.empty((*shape[:2], len(kept)), np.float32)
+    for index, name in enumerate(kept):
+        features[:, :, index] = planes[name][0]
+    penalty = tuple(planes[name][1] for name in kept)
+    edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
+    albedo = np.ones(shape, np.float32)
+    emission = smooth_emission = np.zeros(shape, np.float32)
+    if albedos is not None:
+        noisy, smooth = albedos
+        albedo = divisor(np.clip(smooth, 0, 1))
+        emission = np.maximum(noisy - 1, 0) * np.float32(scale)
+        smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
+        if emission.any():
+            smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
+    left_out = {name: float(planes[name][0][0, 0]) for name in flat}
+    return Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
 
 
 def _smooth_emission(
     emission: FloatImage, filtered: FloatImage, edges: FloatImage, threads: int
 ) -> FloatImage:
-    """The pre-filter blurs long edges of bright lights, the mean along edges their corners."""
+    # The pre-filter blurs long edges of bright lights, the mean along edges their corners.
     smooth: FloatImage = np.float32(0.5) * (filtered + _along_edges(emission, edges, EDGES.radius, threads))
     return smooth
 
 
 def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
-    """Return an albedo above 1 only where both halves saw light emitted, in about the same place.
+    """Return an albedo above 1 only where both halves saw emission, in about the same place.
 
-    A path that chanced upon a light through glass or a mirror is noise, and left to the colour: as emission
-    it would stay where it is, and be believed.
+    A path that hit a light through glass or a mirror by chance is noise, and remains in the colour: as
+    emission it would not be denoised.
     """
     if albedo.halves is None or not (albedo.mean > 1).any():
         return albedo
@@ -244,37 +282,37 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
 
 
 def _feature_planes(
-    filtered: RenderBuffers, half: int, halves: int, depth_scale: float
+    filtered: RenderBuffers, index: int, count: int, depth_scale: float
 ) -> dict[str, tuple[FloatImage, float]]:
-    """Every channel of a half's features, scaled, and its penalty."""
+    """Return every channel of the features of one of ``count`` colours, scaled, and its penalty."""
     scaled: list[tuple[str, FloatImage, float]] = []
     if filtered.albedo is not None:
-        albedo = _planes(filtered.albedo, halves)[half]
+        albedo = _planes(filtered.albedo, count)[index]
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
         scaled.append(("albedo", np.clip(albedo, 0, 1) + brightness, _ALBEDO_PENALTY))
     if filtered.normal is not None:
-        normal = np.clip(_planes(filtered.normal, halves)[half], -1, 1)
+        normal = np.clip(_planes(filtered.normal, count)[index], -1, 1)
         scaled.append(("normal", normal, _NORMAL_PENALTY))
     if filtered.depth is not None:
-        depth = _planes(filtered.depth, halves)[half]
+        depth = _planes(filtered.depth, count)[index]
         # Bounded for any unit of length; near and far surfaces stay apart.
         bounded = np.float32(_DEPTH_SCALE) * depth / (depth + np.float32(depth_scale))
         scaled.append(("depth", bounded, _DEPTH_PENALTY))
     return {
-        f"{name}.{channel}": (image[:, :, index], penalty)
+        f"{name}.{channel}": (image[:, :, column], penalty)
         for name, image, penalty in scaled
-        for index, channel in enumerate(_CHANNELS[name])
+        for column, channel in enumerate(_CHANNELS[name])
     }
 
 
 def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
-    """Both halves of a feature, or its mean ``count`` times."""
+    """Both halves of a feature, or its mean alone for one colour."""
     return feature.halves_or_mean if count == 2 else (feature.mean,)
 
 
 def divisor(albedo: FloatImage) -> FloatImage:
-    """Return what divides the colour of surfaces of this albedo, so that light is left."""
+    """Return the albedo by which the colour is divided, shape (height, width, 3), never 0."""
     black = channel_mean(albedo) < _BLACK_ALBEDO
     return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
 
@@ -284,8 +322,8 @@ def first_guides(
 ) -> Guides:
     """Return the guides of the two halves, or of the mean alone.
 
-    How noisy guides are is told by the difference of the halves' or, of the mean alone, by its ``variance``
-    (same shape).
+    The noise of guides is estimated from the difference of the halves' or, for the mean alone, from its
+    ``variance`` (same shape).
     """
     irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     first = FIRST_GUIDE if guidance[0].penalty else FIRST_GUIDE_WITHOUT_FEATURES
@@ -306,8 +344,9 @@ def following_guides(
 ) -> tuple[Guides, Halves, Halves]:
     """Return guides as `first_guides`, at a part of its cost.
 
-    ``previous`` is what the previous frame's halves show of this one, NaN where they show nothing. It is the
-    guide, filled by the first of `FOLLOWING_PILOTS`; both come as well: (guides, first pilot, filled).
+    ``previous`` are the halves of the previous frame's result, reprojected to this one, NaN where they have
+    no value. They are the guide, filled by the first of `FOLLOWING_PILOTS`. Returns (guides, first pilot,
+    filled previous frame), the last two as linear radiance.
     """
     irradiance_a, irradiance_b = (g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
     irradiances = irradiance_a, irradiance_b
@@ -319,19 +358,19 @@ def following_guides(
         np.where(np.isfinite(image), np.maximum(image, 0), first).astype(np.float32)
         for image, first in zip(previous, (first_a, first_b), strict=True)
     )
-    shown = tuple(
+    smooth = tuple(
         np.maximum((image - g.smooth_emission) / g.albedo, 0)
         for image, g in zip((filled_a, filled_b), guidance, strict=True)
     )
-    guides = _guides(shown, irradiances, guidance[0])
+    guides = _guides(smooth, irradiances, guidance[0])
     return guides, (first_a, first_b), (filled_a, filled_b)
 
 
 @dataclass
 class PilotMaker:
-    """Makes the pilots of both halves, or of the mean alone; ``variance`` as `first_guides` takes it.
+    """Computes the pilots of both halves, or of the mean alone; ``variance`` as in `first_guides`.
 
-    ``previous``, what `following_guides` has filled, guides those that see the colour alone, if it is there.
+    ``previous``, the filled frame of `following_guides`, is the guide of pilots ``by_color`` if given.
     """
 
     colors: tuple[FloatImage, ...]
@@ -416,7 +455,7 @@ def _regress(
     return _core.regress(
         image,
         features,
-        # A guide tells what differs in light apart, but not dark surfaces from the empty space behind.
+        # A guide distinguishes what differs in irradiance, but not dark surfaces from the empty space behind.
         tuple(p if name.startswith("depth") else 0.0 for name, p in zip(names, penalty, strict=True)),
         guide,
         guide_variance,
