@@ -22,6 +22,7 @@ from tungsten_dip.fit.pilots import (
     DRAFT_PILOTS,
     FOLLOWING_PILOTS,
     Guidance,
+    Guides,
     Pilot,
     PilotMaker,
     first_guides,
@@ -159,11 +160,9 @@ def evidence_from_buffers(
 
     Raises InputError if the layout names a feature that is missing or another number of candidates.
     """
-    notes = _notes_on_features(buffers)
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
     mean, halves, fireflies = _without_fireflies(buffers.color, scale, threads)
-    notes += fireflies
     guidance = guidance_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
     handed_in = [_scaled_halves(pair, scale) for pair in candidates]
@@ -173,36 +172,55 @@ def evidence_from_buffers(
         progress(0.15, "Open Image Denoise")
     if layout is not None:
         _check_fits(layout, guidance[0], len(handed_in) + (previous is not None))
+
     occupied = _occupied(halves, buffers, threads)
-    computed: dict[Pilot, Halves] = {}
-    moved = None
+    guides, known, filled = _guides(halves, guidance, previous, scale, occupied)
+    maker = PilotMaker(halves, guidance, guides, previous=filled)
+    budget = clock if layout is None else Clock()
+    computed = _computed(maker, pilots, known, occupied, budget, progress)
+    if filled is not None:
+        handed_in.append(filled)
+
+    images = (halves, *computed, *handed_in)
+    reference, noises = _judged(images, computed[-1], threads, None if layout is None else layout.reference)
+    if layout is None:
+        layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(handed_in), reference)
+    features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
+    notes = (*_notes_on_features(buffers), *fireflies)
+    return Evidence(scale, mean, features, layout, images, noises, guides.noise, notes, threads)
+
+
+def _guides(
+    halves: Halves,
+    guidance: tuple[Guidance, ...],
+    previous: Halves | None,
+    scale: float,
+    occupied: FloatImage,
+) -> tuple[Guides, dict[Pilot, Halves], Halves | None]:
+    """Return the guides, pilots that are computed along with them, and the previous frame, filled."""
     if previous is None:
-        guides = first_guides(halves, guidance)
-    else:
-        guides, first, moved = following_guides(halves, _scaled_halves(previous, scale), guidance)
-        computed[FOLLOWING_PILOTS[0]] = _masked(first, occupied)
-        moved = _masked(moved, occupied)
-    maker = PilotMaker(halves, guidance, guides, previous=moved)
-    images: list[Halves] = [halves]
+        return first_guides(halves, guidance), {}, None
+    guides, first, filled = following_guides(halves, _scaled_halves(previous, scale), guidance)
+    return guides, {FOLLOWING_PILOTS[0]: _masked(first, occupied)}, _masked(filled, occupied)
+
+
+def _computed(
+    maker: PilotMaker,
+    pilots: Sequence[Pilot],
+    known: dict[Pilot, Halves],
+    occupied: FloatImage,
+    clock: Clock,
+    progress: Progress,
+) -> list[Halves]:
+    """Compute the pilots that are not ``known``, the first always, others while the time budget allows."""
+    computed: list[Halves] = []
     for index, pilot in enumerate(pilots):
         progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE
-        if layout is None and index > 0 and clock.share_spent() > share:
+        if index > 0 and clock.share_spent() > share:
             break
-        if pilot not in computed:
-            computed[pilot] = _masked(maker.images(pilot), occupied)
-        images.append(computed[pilot])
-    pilots = tuple(pilots[: len(images) - 1])
-    images += handed_in if moved is None else [*handed_in, moved]
-
-    denominators = denominators_of(images[len(pilots)])
-    errors = [_errors(pilot, halves, denominators) for pilot in images]
-    if layout is None:
-        candidate_count = len(images) - 1 - len(pilots)
-        layout = Layout(guidance[0].names, pilots, candidate_count, reference=_best_pilot(errors))
-    noises = _noises(errors[layout.reference], threads)
-    features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
-    return Evidence(scale, mean, features, layout, tuple(images), noises, guides.noise, tuple(notes), threads)
+        computed.append(known[pilot] if pilot in known else _masked(maker.images(pilot), occupied))
+    return computed
 
 
 def _without_fireflies(
@@ -265,17 +283,26 @@ def pilots_of_all_samples(
 
 
 def with_best_reference(evidence: Evidence) -> Evidence:
-    """Return the same evidence with the pilots compared with the one that is best on this image."""
-    denominators = denominators_of(evidence.smooth)
-    errors = [_errors(pilot, evidence.halves, denominators) for pilot in evidence.pilots]
-    layout = replace(evidence.layout, reference=_best_pilot(errors))
-    noises = _noises(errors[layout.reference], evidence.threads)
-    return replace(evidence, layout=layout, noises=noises)
+    """Return the same evidence with the pilot that is best on this image as the reference."""
+    reference, noises = _judged(evidence.pilots, evidence.smooth, evidence.threads)
+    return replace(evidence, layout=replace(evidence.layout, reference=reference), noises=noises)
 
 
-def _best_pilot(errors: Sequence[Halves]) -> int:
-    mean_errors = [sum(float(np.minimum(e, 1).mean()) for e in pair) for pair in errors[1:]]
-    return 1 + int(np.argmin(mean_errors))
+def _judged(
+    images: Sequence[Halves], smooth: Halves, threads: int, reference: int | None = None
+) -> tuple[int, Halves]:
+    """Return the index of the reference and `Evidence.noises`.
+
+    ``images`` are the noisy halves, then the pilots, the best of which is the reference if none is given.
+    """
+    denominators = denominators_of(smooth)
+    if reference is None:
+        mean_errors = [
+            sum(float(np.minimum(error, 1).mean()) for error in _errors(image, images[0], denominators))
+            for image in images[1:]
+        ]
+        reference = 1 + int(np.argmin(mean_errors))
+    return reference, _noises(_errors(images[reference], images[0], denominators), threads)
 
 
 def _noises(errors_of_reference: Halves, threads: int) -> Halves:
@@ -343,10 +370,10 @@ def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImag
     return near.astype(np.float32)
 
 
-def _notes_on_features(buffers: RenderBuffers) -> list[str]:
+def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
     """Return what there is to say of features that are missing."""
     missing = [name for name in FEATURES if getattr(buffers, name) is None]
-    return [f"no {', '.join(missing)}: edges are found with less evidence"] if missing else []
+    return (f"no {', '.join(missing)}: edges are found with less evidence",) if missing else ()
 
 
 def scaled(image: FloatImage, scale: float) -> FloatImage:

@@ -38,8 +38,8 @@ _BRIGHTEST_ALBEDO = 1e6
 """The regression does not distinguish brighter emission, in the renderer's units."""
 
 _GUIDE_OFFSET = 0.05
-"""Guides are log(irradiance + offset), of radiance for `Pilot.by_color`: far below the offset, what is visible
-is the absolute difference, not the relative one."""
+"""Guides are log(irradiance + offset), of radiance for `Pilot.by_color`: far below the offset it is absolute
+differences that are visible, not relative ones."""
 
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
