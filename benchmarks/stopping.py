@@ -43,8 +43,8 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
                 image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])
                 found.append(compare(image.reshape(evidence.mean.shape), bench_set.reference).psnr)
 
-    def start(evidence: Evidence, seed: int, model: Model | None = None) -> Start:
-        starts.append(start_of_training(evidence, seed, model))
+    def start(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
+        starts.append(start_of_training(evidence, seed, model, members))
         return starts[-1]
 
     with (

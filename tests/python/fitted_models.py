@@ -26,9 +26,9 @@ def paper_model(network: str, buffers: RenderBuffers, **changes: Any) -> Model:
 
 def session_of(model: Model) -> Any:
     """Return an onnxruntime session of the model's graph."""
-    return session_from_proto(graph_of(model, {}), 1)
+    return session_from_proto(graph_of(model), 1)
 
 
 def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
     """Return what a fit of preset draft knows of the buffers, with other pilots."""
-    return evidence_from_buffers(buffers, DRAFT, pilots, (), Clock(), silent)
+    return evidence_from_buffers(buffers, DRAFT, pilots, (), Clock(), silent, None, None)

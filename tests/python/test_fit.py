@@ -668,7 +668,7 @@ def test_batches_show_all_that_is_trained_on_and_nothing_else(
     for _ in range(200):
         batch = next(batches)
         assert len(batch.inputs) == min(size, 2 * len(trained))
-        np.testing.assert_array_equal(batch.wanted, batch.inputs)
+        np.testing.assert_array_equal(batch.target, batch.inputs)
         seen |= set(batch.inputs.ravel().tolist())
     assert seen == {*trained, *(pixels + trained)}
 

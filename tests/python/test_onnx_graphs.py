@@ -159,7 +159,7 @@ def test_a_plane_that_varies_little_around_a_large_mean_keeps_its_digits() -> No
     flat = raw.reshape(2, planes, -1).transpose(0, 2, 1).copy()
     mean = np.full(planes, 1e4 + 1e-5)
     standardisation = Standardisation(mean, np.full(planes, 0.02, np.float32))
-    weights = first_weights(layout, 0)
+    weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
     fit = Model("pointwise", layout.planes, weights, FitSettings(), None, "", layout, standardisation)
     pilots = rng.random((2, 2, 3, 6, 7), np.float32)

@@ -20,6 +20,10 @@ def settings(**changes):
     return FitSettings(**{"preset": "paper", "channels": (4, 6), "device": "cpu", "threads": 1, **changes})
 
 
+def fitted(buffers, chosen, progress=silent):
+    return fit_paper(buffers, chosen, progress, warm_start=None)
+
+
 def noise_buffers(height=HEIGHT, width=WIDTH, **changes):
     """Every plane of every quantity, all of them varying."""
     random = np.random.default_rng(3)
@@ -60,7 +64,7 @@ def test_ioc_asks_for_colour_and_features_of_random_input():
     images = paper_images(buffers, settings(scheme="ioc"))
     assert (images.given.shape[2], images.random_channels, images.wanted.shape[2]) == (0, 3, 39)
     np.testing.assert_array_equal(images.wanted[:, :, :3], ldr_from_radiance(buffers.color.mean))
-    result = fit_paper(buffers, settings(scheme="ioc", iterations=2))
+    result = fitted(buffers, settings(scheme="ioc", iterations=2))
     assert result.color.shape == (HEIGHT, WIDTH, 3)
 
 
@@ -120,7 +124,7 @@ def test_all_uses_what_is_there_and_says_so():
 
 def test_overfits_a_tiny_image():
     buffers = smooth_buffers()
-    result = fit_paper(buffers, settings(iterations=400, inputs="all+random", channels=(8, 16)))
+    result = fitted(buffers, settings(iterations=400, inputs="all+random", channels=(8, 16)))
     error = np.mean((ldr_from_radiance(result.color) - ldr_from_radiance(buffers.color.mean)) ** 2)
     assert -10 * np.log10(error) > 25
     assert [point.iteration for point in result.history] == [100, 200, 300, 400]
@@ -132,7 +136,7 @@ def test_same_seed_same_bits_and_nothing_global_changes(network):
     torch.manual_seed(1)
     state, threads = torch.get_rng_state(), torch.get_num_threads()
     first, again, other = (
-        fit_paper(noise_buffers(), settings(iterations=3, network=network, seed=seed)).color
+        fitted(noise_buffers(), settings(iterations=3, network=network, seed=seed)).color
         for seed in (5, 5, 6)
     )
     np.testing.assert_array_equal(first, again)
@@ -216,7 +220,7 @@ def test_input_noise_is_fresh_and_of_the_published_strength():
 
 
 def test_time_budget_ends_the_fit_after_at_least_one_iteration():
-    result = fit_paper(noise_buffers(), settings(time_budget_s=1e-6))
+    result = fitted(noise_buffers(), settings(time_budget_s=1e-6))
     assert result.iterations == 1
     assert "the time budget ended at iteration 1 of 3000" in result.notes
 
@@ -226,18 +230,18 @@ def test_interrupt_returns_the_average_so_far():
         if message.startswith("iteration 3"):
             raise KeyboardInterrupt
 
-    interrupted = fit_paper(noise_buffers(), settings(iterations=9), stop)
+    interrupted = fitted(noise_buffers(), settings(iterations=9), stop)
     assert interrupted.iterations == 3
     assert interrupted.interrupted
     assert "interrupted at iteration 3 of 9" in interrupted.notes
-    whole = fit_paper(noise_buffers(), settings(iterations=3))
+    whole = fitted(noise_buffers(), settings(iterations=3))
     assert not whole.interrupted
     np.testing.assert_array_equal(interrupted.color, whole.color)
 
 
 def test_progress_grows_to_one_and_tells_loss_and_psnr():
     told = []
-    fit_paper(noise_buffers(), settings(iterations=4), lambda *point: told.append(point))
+    fitted(noise_buffers(), settings(iterations=4), lambda *point: told.append(point))
     assert [fraction for fraction, _ in told] == [0.25, 0.5, 0.75, 1.0]
     assert all("loss" in message and "PSNR to noisy" in message for _, message in told)
 
@@ -245,7 +249,7 @@ def test_progress_grows_to_one_and_tells_loss_and_psnr():
 def test_notes_tell_of_clipped_highlights_and_the_missing_error_estimate():
     buffers = noise_buffers()
     buffers.color.mean[0, 0] = 50
-    result = fit_paper(buffers, settings(iterations=1, target_error=0.1, pilot="oidn"), silent)
+    result = fitted(buffers, settings(iterations=1, target_error=0.1, pilot="oidn"), silent)
     for words in ("no error estimate", "clips highlights", "target_error is not used", "pilot is not used"):
         assert any(words in note for note in result.notes)
     assert result.error is None
@@ -253,7 +257,7 @@ def test_notes_tell_of_clipped_highlights_and_the_missing_error_estimate():
 
 
 def test_one_pixel_and_none():
-    assert fit_paper(noise_buffers(1, 1), settings(iterations=2, inputs="all+random")).color.shape == (
+    assert fitted(noise_buffers(1, 1), settings(iterations=2, inputs="all+random")).color.shape == (
         1,
         1,
         3,
@@ -266,13 +270,13 @@ def test_nan_is_refused():
     buffers = noise_buffers()
     buffers.albedo.mean[2, 3, 1] = np.nan
     with pytest.raises(InputError, match="without NaN"):
-        fit_paper(buffers, settings())
+        fitted(buffers, settings())
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_a_missing_device_is_an_input_error():
     with pytest.raises(InputError, match="device cuda"):
-        fit_paper(noise_buffers(), settings(device="cuda"))
+        fitted(noise_buffers(), settings(device="cuda"))
 
 
 def test_bfloat16_moves_the_network_by_less_than_its_input_noise():

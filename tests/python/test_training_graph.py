@@ -28,27 +28,27 @@ from torch_network import TorchNetwork  # noqa: E402
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
     evidence = evidence_of(synthetic_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
-    return start_of_training(evidence, seed).examples, evidence.layout
+    return start_of_training(evidence, seed, None, 1).examples, evidence.layout
 
 
 @pytest.mark.parametrize("pixels", [1, 37, 480])
 def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     examples, layout = examples_for_training()
-    weights = first_weights(layout, seed=3)
+    weights = first_weights(layout, seed=3, members=1)
     rng = np.random.default_rng(4)
     for name, value in weights.items():
         weights[name] = value + rng.normal(0, 0.3, value.shape).astype(np.float32)
     batch = examples.at(rng.integers(2 * 480, size=pixels))
 
     in_torch = TorchNetwork(weights)
-    in_onnx = PointwiseNetwork(weights, len(layout.planes), layout.choices)
+    in_onnx = PointwiseNetwork(weights, len(layout.planes), layout.choices, "cpu")
     proto = training_step(len(layout.planes), layout.choices)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
     feeds = {
         "inputs": batch.inputs,
-        "choices": batch.choices,
-        "wanted": batch.wanted,
+        "pilots": batch.pilots,
+        "target": batch.target,
         "weight": batch.weight,
         "weights": vector,
         "mean": np.zeros_like(vector),
@@ -60,7 +60,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
 
     expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(batch)])
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    squared = (in_onnx.fuse(batch) - batch.wanted) ** 2 * batch.weight
+    squared = (in_onnx.fuse(batch) - batch.target) ** 2 * batch.weight
     assert loss == pytest.approx(squared.mean(), rel=1e-4)
 
     for _ in range(5):
@@ -74,9 +74,11 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
     sizes = len(layout.planes), layout.choices
-    together = PointwiseNetwork(weights, *sizes)
+    together = PointwiseNetwork(weights, *sizes, "cpu")
     parts = {name: np.split(value, 3) for name, value in weights.items()}
-    alone = [PointwiseNetwork({name: part[k] for name, part in parts.items()}, *sizes) for k in range(3)]
+    alone = [
+        PointwiseNetwork({name: part[k] for name, part in parts.items()}, *sizes, "cpu") for k in range(3)
+    ]
     for first in range(0, 300, 100):
         for network in (together, *alone):
             network.step(examples.part(first, first + 100), 1e-2)
@@ -95,8 +97,8 @@ def test_gradients_are_those_of_the_loss() -> None:
     vector = rng.normal(0, 0.5, sum(int(np.prod(s)) for s in shapes.values()))
     feeds = {
         "inputs": rng.normal(size=(pixels, planes)),
-        "choices": rng.random((pixels, choices, 3)),
-        "wanted": rng.random((pixels, 3)),
+        "pilots": rng.random((pixels, choices, 3)),
+        "target": rng.random((pixels, 3)),
         "weight": rng.random((pixels, 1)),
     }
 
@@ -111,8 +113,8 @@ def test_gradients_are_those_of_the_loss() -> None:
             x = x @ parts[0].T + parts[1]
             x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
         shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
-        fused = (shares[:, :, None] * feeds["choices"]).sum(1)
-        return float(np.mean(feeds["weight"] * (fused - feeds["wanted"]) ** 2))
+        fused = (shares[:, :, None] * feeds["pilots"]).sum(1)
+        return float(np.mean(feeds["weight"] * (fused - feeds["target"]) ** 2))
 
     expected = [(loss(vector + d) - loss(vector - d)) / 2e-6 for d in 1e-6 * np.eye(vector.size)]
     zeros = np.zeros(vector.size, np.float32)

@@ -23,8 +23,8 @@ class TorchNetwork:
         self._adam = torch.optim.Adam(self._parameters.values(), betas=(0.9, 0.999), eps=1e-8)
 
     def loss(self, batch: Examples) -> Tensor:
-        wanted, weight = torch.from_numpy(batch.wanted), torch.from_numpy(batch.weight)
-        return ((self._fused(batch) - wanted) ** 2 * weight).mean()
+        target, weight = torch.from_numpy(batch.target), torch.from_numpy(batch.weight)
+        return ((self._fused(batch) - target) ** 2 * weight).mean()
 
     def gradients(self, batch: Examples) -> tuple[Tensor, ...]:
         return torch.autograd.grad(self.loss(batch), list(self._parameters.values()))
@@ -48,4 +48,4 @@ class TorchNetwork:
             x = x @ weight.T + bias
             if layer < 3:
                 x = nn.functional.leaky_relu(x, LEAKY_SLOPE)
-        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.choices)).sum(1)
+        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.pilots)).sum(1)

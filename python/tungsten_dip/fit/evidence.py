@@ -148,8 +148,8 @@ def evidence_from_buffers(
     candidates: Sequence[Halves],
     clock: Clock,
     progress: Progress,
-    previous: Halves | None = None,
-    layout: Layout | None = None,
+    previous: Halves | None,
+    layout: Layout | None,
 ) -> Evidence:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 

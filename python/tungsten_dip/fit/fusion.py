@@ -15,9 +15,9 @@ from threading import Event
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
+from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, source_sha256
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.pilots import (
@@ -32,7 +32,7 @@ from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.fit.training import Start, Training, start_of_training, train
-from tungsten_dip.progress import Progress, silent
+from tungsten_dip.progress import Progress
 
 _LARGE_RADIUS = 18
 """Windows of a larger radius are left out where they would cover the whole image."""
@@ -63,7 +63,7 @@ _PRESETS = {
 def fit_fusion(
     buffers: RenderBuffers,
     settings: FitSettings,
-    progress: Progress = silent,
+    progress: Progress,
     candidates: Sequence[Halves] = (),
     warm_start: Model | None = None,
     previous: Halves | None = None,
@@ -177,8 +177,8 @@ def _fused(
     """Return what the network makes of both halves and, where their pilots are given, of all samples."""
     threads, shape = start.evidence.threads, start.evidence.mean.shape
     halves = [start.examples.of_half(half) for half in (0, 1)]
-    fused = of_both_halves(lambda half: network.fuse(halves[half]).reshape(shape), threads)
+    fused = in_pair(lambda half: network.fuse(halves[half]).reshape(shape), threads)
     if not whole_pilots:
         return fused, None
-    by_a, by_b = of_both_halves(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
+    by_a, by_b = in_pair(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
     return fused, np.float32(0.5) * (by_a + by_b)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.model import FloatArray, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import Layout
 from tungsten_dip.fit.planes import Standardisation
@@ -77,6 +77,12 @@ def check_planes(model: Model, planes: tuple[str, ...]) -> None:
         f"the input does not fit the model: it {' and '.join(differences) or 'orders the planes otherwise'}; "
         f"render the same buffers, or fit without the model"
     )
+
+
+def check_finite(output: FloatArray) -> None:
+    """Raise InputError if a network's output is not finite."""
+    if not np.isfinite(output).all():
+        raise InputError("the model gives no finite image: its weights are too large; fit a new one")
 
 
 def _text(value: Any) -> str:

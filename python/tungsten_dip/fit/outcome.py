@@ -148,8 +148,8 @@ def result_from_fused(
     settings: FitSettings,
     clock: Clock,
     iterations: int,
-    history: Sequence[HistoryPoint] = (),
-    notes: Sequence[str] = (),
+    history: Sequence[HistoryPoint],
+    notes: Sequence[str],
 ) -> FitResult:
     """Make the result of what the network made of each half, or of the input if that is as good.
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
+from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import (
     OUTLIER,
     SCORE_RADII,
@@ -24,7 +25,6 @@ from tungsten_dip.fit.evidence import (
     denominators_of,
     squared_error,
 )
-from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.neighbours import mean_around
 
 PLANES_RADIUS = max(SCORE_RADII)
@@ -114,7 +114,7 @@ def network_inputs(evidence: Evidence) -> FloatArray:
         for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
             column[:] = plane.ravel()
 
-    of_both_halves(fill, evidence.threads)
+    in_pair(fill, evidence.threads)
     return inputs
 
 
@@ -138,7 +138,7 @@ class Standardisation:
                     casting="same_kind",
                 )
 
-        of_both_halves(standardise, threads)
+        in_pair(standardise, threads)
 
 
 def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
@@ -151,8 +151,8 @@ def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
     def squares(half: int) -> Any:
         return sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs[half]))
 
-    mean = sum(of_both_halves(sums, threads)) / count
-    variance = sum(of_both_halves(squares, threads)) / count
+    mean = sum(in_pair(sums, threads)) / count
+    variance = sum(in_pair(squares, threads)) / count
     return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
 
 

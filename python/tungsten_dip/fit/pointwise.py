@@ -18,9 +18,8 @@ import numpy as np
 import onnx
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage
-from tungsten_dip.errors import InputError
 from tungsten_dip.fit.evidence import Indices
-from tungsten_dip.fit.model import Weights
+from tungsten_dip.fit.model import Weights, check_finite
 from tungsten_dip.graphs.builder import GraphBuilder
 from tungsten_dip.graphs.sessions import Device, session_from_proto
 
@@ -37,13 +36,13 @@ _RUN_PIXELS = 1 << 14
 class Examples:
     """What a network is trained on: pixels of an image, those of half A first, or some of them.
 
-    ``inputs`` has shape (pixels, planes), ``choices`` (pixels, pilots, 3), ``wanted``, the other half's
+    ``inputs`` has shape (pixels, planes), ``pilots`` (pixels, pilots, 3), ``target``, the other half's
     colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
     inputs: FloatArray
-    choices: FloatArray
-    wanted: FloatArray
+    pilots: FloatArray
+    target: FloatArray
     weight: FloatArray
 
     def at(self, pixels: Indices) -> Examples:
@@ -60,13 +59,13 @@ class Examples:
         return self.part(half * pixels, (half + 1) * pixels)
 
     def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.inputs, self.choices, self.wanted, self.weight
+        return self.inputs, self.pilots, self.target, self.weight
 
 
 def training_step(planes: int, choices: int) -> onnx.ModelProto:
     """Return the graph of one step.
 
-    Inputs: ``inputs`` (M, planes), standardised, ``choices`` (M, pilots, 3), ``wanted`` (M, 3) and ``weight``
+    Inputs: ``inputs`` (M, planes), standardised, ``pilots`` (M, pilots, 3), ``target`` (M, 3) and ``weight``
     (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square``
     (Adam's moments) and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs:
     ``loss``, the vector ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
@@ -78,14 +77,14 @@ def training_step(planes: int, choices: int) -> onnx.ModelProto:
     build.adam(gradient)
     pixels: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", planes),
-        "choices": ("M", choices, 3),
-        "wanted": ("M", 3),
+        "pilots": ("M", choices, 3),
+        "target": ("M", 3),
         "weight": ("M", 1),
     }
     vectors = dict.fromkeys(("weights", "mean", "square"), (size,))
     numbers = dict.fromkeys(("learning_rate", "step"), (1,))
     given = {"loss": (), "gradient": (size,), **{f"next_{name}": dims for name, dims in vectors.items()}}
-    return build.model("training_step", {**pixels, **vectors, **numbers}, given, metadata={}, version="")
+    return build.model("training_step", {**pixels, **vectors, **numbers}, given)
 
 
 def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
@@ -101,7 +100,7 @@ def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
 class PointwiseNetwork:
     """The members of a network and the states of their optimisers."""
 
-    def __init__(self, weights: Weights, planes: int, choices: int, device: Device = "auto") -> None:
+    def __init__(self, weights: Weights, planes: int, choices: int, device: Device) -> None:
         self._shapes = weight_shapes(planes, choices)
         # The network is too small to share: threads would only wait for one another.
         self._step = session_from_proto(training_step(planes, choices), 1, device)
@@ -118,8 +117,8 @@ class PointwiseNetwork:
                 ["next_weights", "next_mean", "next_square"],
                 {
                     "inputs": batch.inputs,
-                    "choices": batch.choices,
-                    "wanted": batch.wanted,
+                    "pilots": batch.pilots,
+                    "target": batch.target,
                     "weight": batch.weight,
                     "weights": member,
                     "mean": mean,
@@ -141,14 +140,13 @@ class PointwiseNetwork:
             part = slice(first, first + _RUN_PIXELS)
             feeds = {
                 "inputs": examples.inputs[part],
-                "choices": np.stack([image[part] for image in flat], 1) if flat else examples.choices[part],
+                "pilots": np.stack([image[part] for image in flat], 1) if flat else examples.pilots[part],
             }
             by_members = (
                 self._fuse.run(["fused"], {**feeds, "weights": member})[0] for member in self._members
             )
             fused[part] = sum(by_members) / np.float32(len(self._members))
-        if not np.isfinite(fused).all():
-            raise InputError("the model gives no finite image: its weights are too large; fit a new one")
+        check_finite(fused)
         return fused
 
     def weights(self) -> Weights:
@@ -183,10 +181,10 @@ def _forward(planes: int, choices: int) -> onnx.ModelProto:
     build.add("Transpose", build.forward(shapes)["mixed"], perm=[1, 0], output="fused")
     inputs: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", planes),
-        "choices": ("M", choices, 3),
+        "pilots": ("M", choices, 3),
         "weights": (sum(int(np.prod(shape)) for shape in shapes.values()),),
     }
-    return build.model("forward", inputs, {"fused": ("M", 3)}, metadata={}, version="")
+    return build.model("forward", inputs, {"fused": ("M", 3)})
 
 
 class _Step(GraphBuilder):
@@ -210,28 +208,26 @@ class _Step(GraphBuilder):
         # onnxruntime's softmax over the first axis crawls, and so do products of a matrix for every pixel.
         exp = self.add("Exp", self.add("Sub", x, self.add("ReduceMax", x, self.integers(0))))
         known["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
-        pilots = shapes["layer3.bias"][0]
-        flat = self.add(
-            "Transpose", self.add("Reshape", "choices", self.integers(-1, 3 * pilots)), perm=[1, 0]
-        )
-        known["choices"] = self.add("Reshape", flat, self.integers(pilots, 3, -1))
-        shared = self.add("Mul", known["choices"], self.add("Unsqueeze", known["shares"], self.integers(1)))
+        count = shapes["layer3.bias"][0]
+        flat = self.add("Transpose", self.add("Reshape", "pilots", self.integers(-1, 3 * count)), perm=[1, 0])
+        known["pilots"] = self.add("Reshape", flat, self.integers(count, 3, -1))
+        shared = self.add("Mul", known["pilots"], self.add("Unsqueeze", known["shares"], self.integers(1)))
         known["mixed"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
         return known
 
     def gradient(self, shapes: dict[str, tuple[int, ...]]) -> str:
         """Compute ``loss`` and return its derivatives by the weights, as one vector."""
         known = self.forward(shapes)
-        wanted, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("wanted", "weight"))
-        difference = self.add("Sub", known["mixed"], wanted)
+        target, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("target", "weight"))
+        difference = self.add("Sub", known["mixed"], target)
         weighted = self.add("Mul", difference, weight)
         self.add("ReduceMean", self.add("Mul", weighted, difference), keepdims=0, output="loss")
 
         # loss = mean over pixels and channels of weight * difference^2
-        count = self.add("Cast", self.add("Size", "wanted"), to=onnx.TensorProto.FLOAT)
+        count = self.add("Cast", self.add("Size", "target"), to=onnx.TensorProto.FLOAT)
         by_mixed = self.add("Mul", weighted, self.add("Div", self.number(2), count))
         by_share = self.add(
-            "ReduceSum", self.add("Mul", known["choices"], by_mixed), self.integers(1), keepdims=0
+            "ReduceSum", self.add("Mul", known["pilots"], by_mixed), self.integers(1), keepdims=0
         )
         # softmax: share * (derivative - mean of the derivatives by shares)
         mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(0))

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, Indices, Layout, with_best_reference
-from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.outcome import estimate_error, held_out_error
 from tungsten_dip.fit.planes import (
@@ -72,7 +72,7 @@ class Start:
     notes: tuple[str, ...] = ()
 
 
-def start_of_training(evidence: Evidence, seed: int, model: Model | None = None, members: int = 1) -> Start:
+def start_of_training(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
     """Return the examples, and the weights of ``model`` or, where that knows no such images, new ones.
 
     New ones are those of so many ``members`` (`fit.pointwise`).
@@ -103,24 +103,24 @@ def _start(
 ) -> Start:
     """Return the start with its examples; its evidence holds no second copy of what they hold."""
     pixels = inputs.shape[1]
-    choices = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
+    pilots = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
 
     def fill(half: int) -> None:
         for index, pilot in enumerate(evidence.pilots):
-            choices[half, :, index] = pilot[half].reshape(pixels, 3)
+            pilots[half, :, index] = pilot[half].reshape(pixels, 3)
 
-    of_both_halves(fill, evidence.threads)
-    wanted = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
+    in_pair(fill, evidence.threads)
+    target = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
     # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
-    pilots = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
-    examples = Examples(inputs.reshape(2 * pixels, -1), choices.reshape(2 * pixels, -1, 3), wanted, weight)
-    evidence = replace(evidence, pilots=pilots, features=({}, {}))
+    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in pilots.transpose(2, 0, 1, 3))
+    examples = Examples(inputs.reshape(2 * pixels, -1), pilots.reshape(2 * pixels, -1, 3), target, weight)
+    evidence = replace(evidence, pilots=views, features=({}, {}))
     return Start(evidence, examples, standardisation, weights, warm, notes)
 
 
-def first_weights(layout: Layout, seed: int, members: int = 1) -> Weights:
+def first_weights(layout: Layout, seed: int, members: int) -> Weights:
     """Return the weights that untrained networks start from (He et al. 2015, uniform)."""
     rng = np.random.default_rng(seed)
     sizes = (len(layout.planes), HIDDEN, HIDDEN, layout.choices)
@@ -162,6 +162,26 @@ class Training:
     notes: list[str] = field(default_factory=list)
 
 
+@dataclass
+class _EarlyStopping:
+    """The lowest error after a warm start, and the weights that have it."""
+
+    error: float
+    weights: Weights
+    _since_gain: int = 0
+
+    def record(self, error: float, network: PointwiseNetwork) -> None:
+        """Take note of the error that the network has now."""
+        self._since_gain = 0 if error < (1 - _WARM_GAIN) * self.error else self._since_gain + 1
+        if error < self.error:
+            self.error, self.weights = error, network.weights()
+
+    @property
+    def reached(self) -> bool:
+        """Whether the error falls no further."""
+        return self._since_gain >= _WARM_PATIENCE
+
+
 def train(
     network: PointwiseNetwork,
     start: Start,
@@ -173,62 +193,60 @@ def train(
 ) -> Training:
     """Train for ``steps`` steps, or fewer: within the time budget, to the target error, until Ctrl-C.
 
-    Every step is made on ``batch_pixels`` pixels drawn at random.
+    Every step uses at most ``batch_pixels`` pixels, drawn at random (see `_batches`).
 
     After a warm start, the network is done once the error of pixels that are not trained on, as the halves
     tell it, falls no further.
     """
     rng = np.random.default_rng(settings.seed)
     threads = start.evidence.threads
-    warm, pixels = start.warm, len(start.examples.inputs) // 2
+    pixels = len(start.examples.inputs) // 2
     order = rng.permutation(pixels)
-    held_out = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
-    probe, trained = (order[:held_out], order[held_out:]) if held_out else (order, order)
+    probed = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
+    probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
     pilots = start.evidence.pilots_at(probe)
     probes = [start.examples.of_half(half).at(probe) for half in (0, 1)]
     batches = _batches(start.examples, trained, batch_pixels, rng)
     done = Training(notes=list(start.notes))
 
     def estimate(step: int) -> tuple[float, float]:
-        """Return the error, and what the other half says of it."""
-        fused_a, fused_b = of_both_halves(lambda half: network.fuse(probes[half]), threads)
+        """Return the estimated error, and the error on the other half."""
+        fused_a, fused_b = in_pair(lambda half: network.fuse(probes[half]), threads)
         errors = estimate_error(pilots, start.evidence.scale, fused_a, fused_b)
         error = float(errors.mean(dtype=np.float64))
         done.history.append(HistoryPoint(clock.seconds(), step, error))
         return error, held_out_error(pilots, fused_a, fused_b)
 
-    every = _WARM_HISTORY_EVERY if warm else _HISTORY_EVERY
+    every = _WARM_HISTORY_EVERY if start.warm else _HISTORY_EVERY
     spent_before = clock.share_spent()
     left = max(1 - spent_before, 1e-9)
-    best, best_weights, since_best = (estimate(0)[1], network.weights(), 0) if warm else (math.inf, {}, 0)
+    stopping = _EarlyStopping(estimate(0)[1], network.weights()) if start.warm else None
     try:
         for step in range(1, steps + 1):
             rate = min(1.0, step / _WARM_UP_STEPS)
             # What the learning rate anneals over is what ends first: the steps or the budget.
             gone = max((step - 1) / steps, min((clock.share_spent() - spent_before) / left, 1.0))
-            rate *= _WARM_RATE if warm else 0.5 + 0.5 * math.cos(math.pi * gone)
+            rate *= _WARM_RATE if start.warm else 0.5 + 0.5 * math.cos(math.pi * gone)
             network.step(next(batches), LEARNING_RATE * rate)
             done.steps_done = step
             if step % every != 0 and step != steps and step != 1:
                 continue
-            error, told = estimate(step)
+            error, held_out = estimate(step)
             progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
-            if warm:
-                since_best = 0 if told < (1 - _WARM_GAIN) * best else since_best + 1
-                if told < best:
-                    best, best_weights = told, network.weights()
+            if stopping is not None:
+                stopping.record(held_out, network)
             if error <= (settings.target_error or -math.inf):
                 done.notes.append(f"stopped at step {step}: the target error is reached")
                 break
             if clock.share_spent() > 1:
                 done.notes.append(f"stopped at step {step}: the time budget is spent")
                 break
-            if since_best >= _WARM_PATIENCE:
+            if stopping is not None and stopping.reached:
                 done.notes.append(f"stopped at step {step}: the error falls no further")
                 break
     except KeyboardInterrupt:
         done.interrupted = True
         done.notes.append(f"interrupted at step {done.steps_done}: the image is what was reached by then")
-    if warm:
-        network.load(best_weights)
+    if stopping is not None:
+        network.load(stopping.weights)
     return done

@@ -63,8 +63,8 @@ class GraphBuilder:
         name: str,
         inputs: Mapping[str, Dims],
         outputs: Mapping[str, Dims],
-        metadata: dict[str, str],
-        version: str,
+        metadata: dict[str, str] | None = None,
+        version: str = "",
     ) -> onnx.ModelProto:
         """Return the whole, with float32 inputs and outputs of these dimensions (names: of any size)."""
 
@@ -81,5 +81,5 @@ class GraphBuilder:
             producer_name="tungsten-dip",
             producer_version=version,
         )
-        helper.set_model_props(proto, metadata)
+        helper.set_model_props(proto, metadata or {})
         return proto

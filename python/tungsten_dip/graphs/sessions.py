@@ -31,11 +31,11 @@ def check_device(device: Device) -> None:
 def _trial_session() -> Any:
     graph = GraphBuilder()
     graph.add("Identity", "x", output="y")
-    return session_from_proto(graph.model("trial", {"x": (1,)}, {"y": (1,)}, metadata={}, version=""), 1)
+    return session_from_proto(graph.model("trial", {"x": (1,)}, {"y": (1,)}), 1)
 
 
 def session_from_proto(proto: onnx.ModelProto, threads: int, device: Device = "auto") -> Any:
-    """Return a session that runs a graph of our own; threads 0: every core, auto: a GPU if there is one."""
+    """Return a session that runs a graph of our own; device auto: a GPU if there is one."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

@@ -32,7 +32,7 @@ _MOST_MEMBERS = 16
 """Of a pointwise network: the memory that it takes grows with them."""
 
 
-def graph_of(model: Model, metadata: dict[str, str]) -> onnx.ModelProto:
+def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.ModelProto:
     """Return the model's network with its weights.
 
     Pointwise: ``inputs`` (N, planes, H, W), as they come, and ``pilots`` (N, pilots, 3, H, W) give ``color``

@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
-from tungsten_dip.cores import thread_count
+from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
+from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.halves import of_both_halves
-from tungsten_dip.fit.model import Model, check_planes
+from tungsten_dip.fit.model import Model, check_finite, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import finished, prepared
@@ -83,8 +82,8 @@ def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:
 def infer_fusion(
     model: Model,
     buffers: RenderBuffers,
-    threads: int | None = None,
-    progress: Progress = silent,
+    threads: int | None,
+    progress: Progress,
     candidates: Sequence[Halves] = (),
     previous: Halves | None = None,
 ) -> FitResult:
@@ -117,7 +116,7 @@ def _fused(
 ) -> tuple[Halves, FloatImage | None]:
     """Return what the network makes of both halves, and of all samples if given, band by band of rows."""
     # Both halves are computed side by side; the network is too small to share.
-    session = session_from_proto(graph_of(model, metadata={}), 1)
+    session = session_from_proto(graph_of(model), 1)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     rows_at_once = max(1, _RUN_PIXELS // width)
@@ -140,10 +139,11 @@ def _fused(
                 for image, images in zip(fused, choices, strict=True):
                     pilots = np.stack([pilot[part].transpose(2, 0, 1) for pilot in images])[None]
                     color = session.run(["color"], {"inputs": seen, "pilots": pilots})[0]
-                    image[part] = _finite(color)[0].transpose(1, 2, 0)
+                    check_finite(color)
+                    image[part] = color[0].transpose(1, 2, 0)
         return fused
 
-    (half_a, *by_a), (half_b, *by_b) = of_both_halves(of_half, evidence.threads)
+    (half_a, *by_a), (half_b, *by_b) = in_pair(of_half, evidence.threads)
     whole = np.float32(0.5) * (by_a[0] + by_b[0]) if whole_pilots else None
     return (half_a, half_b), whole
 
@@ -156,15 +156,10 @@ def _infer_paper(
     check_planes(model, images.planes)
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
     # Norms of the whole image: no bands here.
-    session = session_from_proto(graph_of(model, metadata={}), thread_count(settings.threads))
-    output = _finite(session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0])
+    session = session_from_proto(graph_of(model), thread_count(settings.threads))
+    output = session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0]
+    check_finite(output)
     ldr = output[0, :3].transpose(1, 2, 0)
     color: FloatImage = np.ascontiguousarray(radiance_from_ldr(ldr))
     progress(1.0, "inferred")
     return FitResult(color, settings, clock.seconds(), iterations=0, model=model, notes=images.notes)
-
-
-def _finite(output: FloatArray) -> FloatArray:
-    if not np.isfinite(output).all():
-        raise InputError("the model gives no finite image: its weights are too large; fit a new one")
-    return output

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.cores import in_pair
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.halves import of_both_halves
 from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
 
 _DEPTH_TOLERANCE = 0.02
@@ -87,7 +87,7 @@ def reproject(
         for sum_of_half in sums:
             sum_of_half /= total[:, None]
 
-    of_both_halves(lambda lower: move(slice(middle, None) if lower else slice(middle)), threads)
+    in_pair(lambda lower: move(slice(middle, None) if lower else slice(middle)), threads)
     albedo_a, albedo_b = _divisors(current)
     return moved_a.reshape(shape) * albedo_a, moved_b.reshape(shape) * albedo_b
 

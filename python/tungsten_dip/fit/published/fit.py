@@ -22,7 +22,7 @@ from tungsten_dip.fit.published.device import compute_device, convolution_dtype
 from tungsten_dip.fit.published.images import PaperImages, network_input, paper_images, radiance_from_ldr
 from tungsten_dip.fit.published.networks import ResNet, Skip
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
-from tungsten_dip.progress import Progress, silent
+from tungsten_dip.progress import Progress
 
 # The numbers of the published notebook.
 LEARNING_RATE = 1e-3
@@ -139,8 +139,8 @@ def learning_rate(loss: float) -> float:
 def fit_paper(
     buffers: RenderBuffers,
     settings: FitSettings,
-    progress: Progress = silent,
-    warm_start: Model | None = None,
+    progress: Progress,
+    warm_start: Model | None,
 ) -> FitResult:
     """Denoise sanitised buffers by the published method, from the weights of a model if there is one.
 
