@@ -117,6 +117,20 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
         infer(paper, without)
 
 
+def test_a_model_that_chooses_among_candidates_needs_independent_halves(frame: SyntheticRender) -> None:
+    candidates = [(frame.reference, frame.reference)]
+    model = denoise(frame.buffers, DRAFT, candidates=candidates).model
+    assert model is not None
+    color = frame.buffers.color
+    without_halves = frame.buffers.with_quantities(color=Buffer(color.mean))
+    for attempt in (
+        lambda: infer(model, without_halves, threads=1, candidates=candidates),
+        lambda: denoise(without_halves, DRAFT, candidates=candidates, warm_start=model),
+    ):
+        with pytest.raises(InputError, match="cannot be judged without independent halves; fit without"):
+            attempt()
+
+
 WITHOUT_EXTRAS = """
 import sys
 for name in ('torch', 'mitsuba', 'skimage', 'flip_evaluator'):

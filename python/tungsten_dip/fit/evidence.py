@@ -150,6 +150,7 @@ def evidence_from_buffers(
     progress: Progress,
     previous: Halves | None,
     layout: Layout | None,
+    halves_drawn: bool,
 ) -> Evidence:
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
@@ -171,7 +172,7 @@ def evidence_from_buffers(
         handed_in.append(_scaled_halves(_oidn_halves(buffers, halves, scale, settings.threads), scale))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, guidance[0], len(handed_in) + (previous is not None))
+        _check_fits(layout, guidance[0], len(handed_in) + (previous is not None), halves_drawn)
 
     occupied = _occupied(halves, buffers, threads)
     guides, known, filled = _guides(halves, guidance, previous, scale, occupied)
@@ -314,12 +315,17 @@ def _noises(errors_of_reference: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, guidance: Guidance, candidates: int) -> None:
+def _check_fits(layout: Layout, guidance: Guidance, candidates: int, halves_drawn: bool) -> None:
     unknown = [n for n in layout.features if n not in guidance.names and n not in guidance.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
+        )
+    if layout.candidates > candidates and halves_drawn:
+        raise InputError(
+            "the model chooses among candidates, which cannot be judged without independent halves; fit "
+            "without the model"
         )
     if layout.candidates != candidates:
         raise InputError(

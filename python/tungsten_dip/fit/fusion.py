@@ -82,7 +82,9 @@ def fit_fusion(
     preset = _preset(settings, following)
     layout = None if warm_start is None else warm_start.layout
     pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
-    evidence = evidence_from_buffers(buffers, settings, pilots, candidates, clock, progress, previous, layout)
+    evidence = evidence_from_buffers(
+        buffers, settings, pilots, candidates, clock, progress, previous, layout, drawn
+    )
     # A time budget is better spent on the steps of one.
     members = preset.members if settings.time_budget_s is None else 1
     start = start_of_training(evidence, settings.seed, warm_start, members)

@@ -98,9 +98,10 @@ def infer_fusion(
     buffers, candidates, notes = with_independent_halves(
         buffers, tuple(candidates), settings.seed, settings.threads
     )
+    drawn = bool(notes)
     layout = model.layout
     evidence = evidence_from_buffers(
-        buffers, settings, layout.pilots, candidates, clock, progress, previous, layout
+        buffers, settings, layout.pilots, candidates, clock, progress, previous, layout, drawn
     )
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
@@ -108,7 +109,7 @@ def infer_fusion(
     fused, whole = _fused(model, evidence, whole_pilots)
     result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), notes)
     progress(1.0, "inferred")
-    return replace(result, model=model, halves_drawn=bool(notes))
+    return replace(result, model=model, halves_drawn=drawn)
 
 
 def _fused(
