@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tungsten_dip.fit.lost_detail import with_what_was_lost
+from tungsten_dip.fit.lost_detail import with_lost_detail
 
 SHAPE = (40, 56, 3)
 
@@ -20,7 +20,7 @@ def test_noise_around_a_good_result_changes_nothing_that_is_seen() -> None:
     truth = np.linspace(0.05, 2, SHAPE[1], dtype=np.float32)[None, :, None] * np.ones(SHAPE, np.float32)
     # Noise as that of paths which seldom find the light: most halves are black, some bright.
     for shape in (0.1, 0.5, 4.0):
-        given = with_what_was_lost(_halves(truth, shape), (truth, truth))
+        given = with_lost_detail(_halves(truth, shape), (truth, truth))
         for image in given:
             assert np.mean((image / truth - 1) ** 2) < 1e-3
 
@@ -30,7 +30,7 @@ def test_what_both_halves_show_is_given_back(lost: float, leaked: float) -> None
     truth = np.full(SHAPE, 0.2, np.float32)
     truth[10:13, 20:24] = lost
     fused = np.full(SHAPE, leaked, np.float32)
-    given = with_what_was_lost(_halves(truth, 32.0), (fused, fused))
+    given = with_lost_detail(_halves(truth, 32.0), (fused, fused))
     mean = (given[0] + given[1]) / 2
     np.testing.assert_allclose(mean[10:13, 20:24].mean(), lost, rtol=0.1)
     assert np.abs(mean[20:] - leaked).mean() < 0.002
@@ -40,7 +40,7 @@ def test_nothing_is_given_back_on_the_word_of_one_half() -> None:
     truth = np.full(SHAPE, 0.2, np.float32)
     halves = _halves(truth, 32.0)
     halves[0][5, 5:15] *= 100
-    given = with_what_was_lost(halves, (truth, truth))
+    given = with_lost_detail(halves, (truth, truth))
     np.testing.assert_array_equal(given[0], truth)
     np.testing.assert_array_equal(given[1], truth)
 
@@ -50,7 +50,7 @@ def test_nothing_is_given_back_on_the_word_of_one_half() -> None:
 def test_any_size_and_radiance_stays_finite(size: tuple[int, ...], radiance: float) -> None:
     halves = np.full(size, radiance, np.float32), np.zeros(size, np.float32)
     for fused in (np.zeros(size, np.float32), np.full(size, 1e15, np.float32)):
-        for image in with_what_was_lost(halves, (fused, fused.copy())):
+        for image in with_lost_detail(halves, (fused, fused.copy())):
             assert np.isfinite(image).all()
             assert (image >= 0).all()
 
@@ -58,6 +58,6 @@ def test_any_size_and_radiance_stays_finite(size: tuple[int, ...], radiance: flo
 def test_no_input_is_modified() -> None:
     halves, fused = _halves(np.full(SHAPE, 0.01, np.float32)), _halves(np.full(SHAPE, 1.0, np.float32))
     copies = [image.copy() for image in (*halves, *fused)]
-    with_what_was_lost(halves, fused)
+    with_lost_detail(halves, fused)
     for image, copy in zip((*halves, *fused), copies, strict=True):
         np.testing.assert_array_equal(image, copy)

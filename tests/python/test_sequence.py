@@ -345,7 +345,7 @@ def test_followed_frames_obey_the_settings(tmp_path):
     first = Follower(DRAFT).denoise(frames[0].buffers).result.model
     follower = Follower(replace(DRAFT, target_error=10.0), models=Models(first=first))
     assert [follower.denoise(frame.buffers).result.iterations for frame in frames] == [1, 1]
-    with pytest.raises(InputError, match="fitted with preset draft, this fit asks for final"):
+    with pytest.raises(InputError, match="fitted with preset draft, this fit is to use final"):
         Follower(FitSettings("final"), models=Models(first=first))
 
 

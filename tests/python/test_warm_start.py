@@ -75,7 +75,7 @@ def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
         np.testing.assert_allclose(result.color, cold.color, rtol=1e-3, atol=1e-4)
     else:
         result = infer(model, unlike, threads=1, refit_steps=20)
-    assert "the model knows no such images: a network is fitted anew" in result.notes
+    assert "the image is too unlike the model's: a new network is fitted" in result.notes
     assert result.iterations == 20
     assert result.model is not None
     assert result.model.standardisation is not None
@@ -101,17 +101,17 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
     for use in (lambda b: infer(model, b), lambda b: denoise(b, DRAFT, warm_start=model)):
         with pytest.raises(InputError, match=r"fitted with normal\.X, normal\.Y, normal\.Z, which"):
             use(without)
-    with pytest.raises(InputError, match="fitted with preset draft, this fit asks for balanced"):
+    with pytest.raises(InputError, match="fitted with preset draft, this fit is to use balanced"):
         denoise(buffers, replace(DRAFT, preset="balanced"), warm_start=model)
     with pytest.raises(InputError, match="fitted with 0 candidates, this input comes with 1"):
         denoise(buffers, DRAFT, candidates=[(frame.reference, frame.reference)], warm_start=model)
 
     paper = paper_model("skip", buffers)
-    with pytest.raises(InputError, match="fitted with preset paper, this fit asks for draft"):
+    with pytest.raises(InputError, match="fitted with preset paper, this fit is to use draft"):
         denoise(buffers, DRAFT, warm_start=paper)
-    with pytest.raises(InputError, match="network skip, this fit asks for resnet"):
+    with pytest.raises(InputError, match="network skip, this fit is to use resnet"):
         denoise(buffers, replace(paper.settings, network="resnet"), warm_start=paper)
-    with pytest.raises(InputError, match="channels 4,6,8, this fit asks for 4,6"):
+    with pytest.raises(InputError, match="channels 4,6,8, this fit is to use 4,6"):
         denoise(buffers, replace(paper.settings, channels=(4, 6)), warm_start=paper)
     with pytest.raises(InputError, match=r"lacks normal mean 0"):
         infer(paper, without)
@@ -188,7 +188,7 @@ def test_save_and_warm_start_on_the_command_line(
     assert load_model(second).settings.iterations == 3
     capfd.readouterr()
     assert command.main([*fit, "--preset", "final", "--warm-start", first]) == 2
-    assert "fitted with preset draft, this fit asks for final" in capfd.readouterr().err
+    assert "fitted with preset draft, this fit is to use final" in capfd.readouterr().err
     assert command.main([*fit, "--warm-start", str(tmp_path / "in" / "color.exr")]) == 2
     assert command.main([*fit, "--save-model", str(tmp_path / "m.pt")]) == 2
     truth = frame.reference
@@ -220,7 +220,7 @@ def test_another_preset_than_the_models_is_named(
     write_tungsten_folder(tmp_path / "in", frame.buffers)
     fit = ["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out.exr"), "--preset", "draft"]
     assert command.main([*fit, "--warm-start", str(tmp_path / "paper.onnx")]) == 2
-    assert "fitted with preset paper, this fit asks for draft" in capfd.readouterr().err
+    assert "fitted with preset paper, this fit is to use draft" in capfd.readouterr().err
 
 
 def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:

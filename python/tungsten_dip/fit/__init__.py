@@ -19,7 +19,7 @@ __all__ = ["FitResult", "FitSettings", "HistoryPoint", "check_ready", "denoise",
 
 
 def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
-    """Raise InputError if a package or device is missing, or other settings than ``warm_start``'s are asked.
+    """Raise InputError if a package or device is missing, or the settings are not ``warm_start``'s.
 
     Loads neither Open Image Denoise nor, but for a GPU, torch: a render may come before the fit.
     """
@@ -61,22 +61,21 @@ def denoise(
     ``buffers`` hold linear radiance of any exposure; they are sanitised first, and only the colour is
     required. The result is linear radiance of the same shape, finite everywhere. The same buffers, settings,
     threads and machine give the same bits, but for a time budget. Ctrl-C once the network is in training ends
-    the fit early with what was reached.
+    the fit early with the image reached so far.
 
-    ``candidates`` are further guesses at the clean image, made by somebody else (another denoiser, say, or
-    the previous frame moved into place): pairs of linear radiance in the shape of the colour, one image for
-    half A of the samples and one for half B, neither of which may know anything of the other half. The
-    network chooses among them and its own. They are not used without independent halves, which are then drawn
-    from the image (`fit.splitting`).
+    ``candidates`` are further estimates of the clean image that the caller supplies (another denoiser's
+    images, for example): pairs of linear radiance in the shape of the colour, one image computed from half A
+    of the samples alone and one from half B alone. The network chooses among them and its own pilots. They
+    are not used without independent halves, which are then drawn from the image (`fit.splitting`).
 
-    ``previous`` is what the halves of the previous frame's result show of this frame, moved into place, NaN
-    where they show nothing. It is a candidate and a guide, beside which fewer pilots are needed.
+    ``previous`` are the halves of the previous frame's result, reprojected to this frame, NaN where they have
+    no value. They are a candidate and a guide, with which fewer pilots are needed.
 
-    With ``warm_start`` (of an earlier frame, say) the network starts from the model's weights, with its
-    pilots and constants, and trains for as many steps as the error that the halves tell asks for, at most
-    ``settings.iterations``. Without settings, those of the model hold, but for the iterations.
+    With ``warm_start`` (of an earlier frame, for example) the network starts from the model's weights, with
+    its pilots and constants, and trains until the error estimated from the halves falls no further, for at
+    most ``settings.iterations`` steps. Without settings, those of the model hold, but for the iterations.
 
-    Raises InputError if the image is empty, what the settings ask for is missing (a buffer, a device, torch
+    Raises InputError if the image is empty, what the settings require is missing (a buffer, a device, torch
     for the preset paper), candidates are of another shape or not finite, or the model does not fit the image
     or the settings.
     """

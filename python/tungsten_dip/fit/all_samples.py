@@ -1,7 +1,8 @@
-"""What all samples together say, once their halves have told which pilots are right.
+"""Moves the result towards the blended pilots of all samples, with the weights found from the halves.
 
-A pilot that sees all samples compares pixels by half the noise, and tells more apart than the mean of two
-pilots that saw a half each. But nothing is left to score it, and what it makes of an outlier may look true.
+Guides and features of all samples have half the noise variance, so that their pilots resolve more than the
+mean of two pilots of a half each. But no independent samples are left to score them, and they retain
+outliers.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ from tungsten_dip.buffers.model import FloatImage, Halves
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
-"""Relative difference of the halves' results from their mean at which all samples are half believed."""
+"""Relative difference of the halves' results from their mean at which ``whole`` gets weight 0.5."""
 
 
 def with_all_samples(fused: Halves, whole: FloatImage, threads: int) -> FloatImage:
-    """Return the mean of both halves' results, moved towards what the same weights make of all samples.
+    """Return the mean of both halves' results, moved towards ``whole``, the blended pilots of all samples.
 
-    All have shape (height, width, 3). ``whole`` is followed no further than the halves' results differ in the
-    pixels around, and less where they differ by much.
+    All are linear radiance of shape (height, width, 3). The result moves no further than the halves' results
+    differ in the surrounding pixels, and less where they differ strongly.
     """
     a, b = fused
     image = np.float32(0.5) * (a + b)

@@ -1,4 +1,4 @@
-"""Guesses at the clean image that somebody else made, checked before anything relies on them."""
+"""Checks estimates of the clean image that the caller supplies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> 
 
 
 def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves | None:
-    """Return the previous frame's halves as float32, NaN where they show nothing.
+    """Return the previous frame's halves as float32, NaN where they have no value.
 
     Raises InputError if they are not a pair of images of the colour's shape.
     """

@@ -1,4 +1,4 @@
-"""What is known of an image before a network is fitted to it: its halves, its features, and its pilots."""
+"""What is computed from an image before a network is fitted to it: its halves, its features, its pilots."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _NEAR_RADIUS = 2
 """Of the windows that must be empty for a pixel to be empty space."""
 
 OUTLIER = 20.0
-"""Squared errors are capped at so many times the local mean where they tell how noisy a place is."""
+"""Squared errors are capped at so many times the local mean where local noise is estimated from them."""
 
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
@@ -55,11 +55,11 @@ _DRAFT_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Layout:
-    """What a network sees and chooses among: the same for every image that it is used on.
+    """The inputs of a network and the images it chooses among: the same for every image that it is used on.
 
-    ``features`` names channels of the features. The pilots are the noisy image, then what ``pilots``
-    describes, then ``candidates`` images that are handed in. ``reference`` is the index of the one that the
-    others are compared with.
+    ``features`` names channels of the features. The images are the noisy one, then the ``pilots``, then
+    ``candidates`` images that the caller supplies. ``reference`` is the index of the pilot that the others
+    are compared with.
     """
 
     features: tuple[str, ...]
@@ -90,12 +90,12 @@ class Layout:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one image, its radiance multiplied by ``scale`` (a power of two).
+    """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
-    (height, width). ``pilots`` holds what each pilot makes of both halves, the noisy halves themselves first.
+    (height, width). ``pilots`` holds both halves of every pilot, the noisy halves themselves first.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and the
-    half that it has not seen, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
+    other half, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
     `Guides`).
     """
 
@@ -124,7 +124,7 @@ class Evidence:
         return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.pilots)
 
     def rows(self, first: int, end: int) -> Evidence:
-        """Return what is known of some rows alone."""
+        """Return the evidence of some rows alone."""
 
         def cut(images: Halves) -> Halves:
             return images[0][first:end], images[1][first:end]
@@ -155,11 +155,11 @@ def evidence_from_buffers(
     """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
 
     The buffers have halves, and their noise is independent (`splitting`). ``candidates`` are further pilots
-    that somebody else computed, of linear radiance. ``previous`` is one more, NaN where it shows nothing,
-    that guides the others as well. ``layout`` is that of a network which exists, the pilots being its own:
-    all of them are computed.
+    that the caller supplies, of linear radiance. ``previous`` is one more, NaN where it has no value, that
+    guides the others as well. ``layout`` is that of a fitted network, and ``pilots`` are its pilots: all of
+    them are computed. ``halves_drawn``: the halves were drawn from the image, and candidates left out.
 
-    Raises InputError if the layout names a feature that is missing or another number of candidates.
+    Raises InputError if the layout has a feature that is missing or another number of candidates.
     """
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
@@ -227,13 +227,13 @@ def _computed(
 def _without_fireflies(
     color: Buffer, scale: float, threads: int
 ) -> tuple[FloatImage, Halves, tuple[str, ...]]:
-    """Return the mean and the halves, scaled, and what there is to say of fireflies."""
+    """Return the mean and the halves, scaled, and a note on fireflies, if there are any."""
     assert color.halves is not None
     half_a, half_b = color.halves
-    halves, told = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
-    if told is None:
+    halves, note = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
+    if note is None:
         return scaled(color.mean, scale), halves, ()
-    return np.float32(0.5) * (halves[0] + halves[1]), halves, (told,)
+    return np.float32(0.5) * (halves[0] + halves[1]), halves, (note,)
 
 
 def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:
@@ -254,11 +254,11 @@ def pilots_of_all_samples(
     clock: Clock,
     given_up: Event | None = None,
 ) -> tuple[FloatImage, ...]:
-    """Return what the pilots make of all samples, with less noisy features and guides than a half's.
+    """Return the pilots of all samples, with less noisy features and guides than a half's.
 
     One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
     all for the preset draft, or where the pilots of the halves have used up their share of the time budget,
-    or once somebody sets ``given_up``.
+    or once ``given_up`` is set.
     """
     if settings.preset == "draft" or clock.share_spent() > _PILOTS_SHARE:
         return ()
@@ -341,13 +341,13 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
 
 
 def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
-    """Return what Open Image Denoise makes of all samples, never negative."""
+    """Return the result of Open Image Denoise for all samples, never negative."""
     albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
     return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
 
 
 def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: int | None) -> Halves:
-    """What Open Image Denoise makes of each half, from the features of that half alone."""
+    """Return the result of Open Image Denoise for each half, with the features of that half alone."""
 
     def of_half(feature: Buffer | None, half: int) -> FloatImage | None:
         return None if feature is None else feature.halves_or_mean[half]
@@ -365,19 +365,20 @@ def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: 
 
 
 def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:
-    """0 where no sample in the 5x5 pixels around hit anything or brought light, else 1; (height, width, 1).
+    """Return 0 where no sample in the 5x5 pixels around hit anything or had radiance, else 1.
 
-    Empty space is black to the eye only if it is black: what filters spread into it is seen at once.
+    Shape (height, width, 1), or (1, 1, 1) without depth. In black empty space, any radiance that filters
+    spread there is visible.
     """
     if buffers.depth is None:
         return np.ones((1, 1, 1), np.float32)
-    seen = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
-    near = _core.box_mean(seen.astype(np.float32), _NEAR_RADIUS, threads) > 0
+    hit = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
+    near = _core.box_mean(hit.astype(np.float32), _NEAR_RADIUS, threads) > 0
     return near.astype(np.float32)
 
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
-    """Return what there is to say of features that are missing."""
+    """Return a note on missing features, if there are any."""
     missing = [name for name in FEATURES if getattr(buffers, name) is None]
     return (f"no {', '.join(missing)}: edges are found with less evidence",) if missing else ()
 

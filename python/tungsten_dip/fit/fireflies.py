@@ -9,16 +9,16 @@ from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8
 _LIMIT = 15.0
-"""How many times brighter than its surroundings a pixel may be that only one half of the samples shows so."""
+"""How many times brighter than its surroundings a pixel may be in one half alone."""
 
 _LIMIT_OF_OTHER = 4.0
-"""How many times brighter than in the other half: what is there at all, both halves show about alike."""
+"""How many times brighter than in the other half: real detail is about equal in both halves."""
 
 _ROUNDS = 100
 """Enough for a cluster of 3x3 pixels, which every round lowers to 0.4 of itself, from 1e30 to 1e-10."""
 
 _SETTLED = 0.9
-"""Surroundings are known well enough once a round lowers no pixel below this part of itself."""
+"""The mean of the surroundings has converged once a round lowers no pixel below this part of itself."""
 
 _BRIGHTEST = 1e30
 """Sums of brighter pixels overflow."""
@@ -27,9 +27,9 @@ _BRIGHTEST = 1e30
 def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tuple[Halves, str | None]:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    What both halves show about alike is left alone, whatever its radiance, and so is everything up to 15
-    times the mean of the 17x17 pixels around it. Returns both halves and a note of what was taken away, if
-    anything.
+    What is about equal in both halves is left alone, whatever its radiance, and so is everything up to 15
+    times the mean of the 17x17 pixels around it. Returns both halves and a note on the radiance that was
+    removed, if any.
     """
     levels = [_level(half) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)

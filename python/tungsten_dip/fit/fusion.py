@@ -1,8 +1,9 @@
 """The presets draft, balanced and final: a small network chooses among pilots, trained across the halves.
 
-The network sees one pixel of one half: its planes (`planes`). It answers with the weights of a mean of the
-pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". All this is
-linear in the scored half, so noise adds a constant to the loss and nothing to the image: the mean is kept.
+The network's inputs are the planes (`planes`) of one pixel of one half. It outputs the weights of a mean of
+the pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". The noise of
+the other half is independent: it adds a constant to the loss and does not enter the image, whose mean is
+preserved.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ def _trained(
 def _fused(
     network: PointwiseNetwork, start: Start, whole_pilots: tuple[FloatImage, ...]
 ) -> tuple[Halves, FloatImage | None]:
-    """Return what the network makes of both halves and, where their pilots are given, of all samples."""
+    """Return the network's blend of the pilots of both halves and, if given, of all samples."""
     threads, shape = start.evidence.threads, start.evidence.mean.shape
     halves = [start.examples.of_half(half) for half in (0, 1)]
     fused = in_pair(lambda half: network.fuse(halves[half]).reshape(shape), threads)

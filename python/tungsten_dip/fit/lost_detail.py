@@ -1,8 +1,8 @@
-"""Gives back detail that the fit has lost, where both halves agree on it.
+"""Adds detail back that the fit has lost, where both halves confirm it.
 
 A noisy pixel far darker or brighter than the result is noise as a rule, but not where light has leaked over
-an edge that no feature shows, where a highlight was smoothed away, or where the network was fitted to another
-image. The half of the samples that was not looked at tells which.
+an edge that no feature contains, where a highlight was smoothed away, or where the network was fitted to
+another image. The other half, whose noise is independent, distinguishes these cases.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _OCTAVES = np.arange(0, 4.5, 0.5)
 """Pixels so many factors of two darker (or brighter) than the result, or more, are judged together."""
 
 _FEW = 6
-"""Fewer pixels tell nothing of others: among heavy-tailed noise their standard error is too small."""
+"""From fewer pixels no slope is estimated: with heavy-tailed noise their standard error is too small."""
 
 _SURELY = 2.0
-"""So many standard errors are taken from a slope before it is believed."""
+"""So many standard errors are subtracted from a slope."""
 
 _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""
 
 
-def with_what_was_lost(halves: Halves, fused: Halves) -> Halves:
-    """Give back to each half's image what its noisy half rightly shows otherwise.
+def with_lost_detail(halves: Halves, fused: Halves) -> Halves:
+    """Add detail back to each half's image that its noisy half contains and the other half confirms.
 
-    ``halves`` are the noisy halves and ``fused`` what was made of each alone, both in the units of
+    ``halves`` are the noisy halves and ``fused`` the denoised ones, both linear and in the units of
     `evidence.Evidence`, shape (height, width, 3). With f a half's result, a its noisy half, b the other one
     and d = f^2 + 0.01, over all pixels in which a and f differ by some factor and more
 
         slope = sum p / sum q,  standard error = sqrt(sum (p - slope q)^2) / sum q  (White 1980),
         p = (a - f) (b - f) / d,  q = (a - f)^2 / d.
 
-    The noise of b is independent, so the slope is the part of the difference a - f that is true; as much of
-    it as is sure is given back. On most images that is nothing.
+    The noise of b is independent, so the slope is the part of the difference a - f that is real; the part
+    that is statistically certain is added back. On most images that is nothing.
     """
     octaves = [np.log2(_level(noisy) / _level(image)) for noisy, image in zip(halves, fused, strict=True)]
     given = [image.copy() for image in fused]
@@ -50,10 +50,10 @@ def with_what_was_lost(halves: Halves, fused: Halves) -> Halves:
         products, squares = [], []
         for half, place in enumerate(places):
             image = fused[half][place].astype(np.float64)
-            shown, shown_by_other = halves[half][place] - image, halves[1 - half][place] - image
+            own, other = halves[half][place] - image, halves[1 - half][place] - image
             denominator = image.mean(axis=1) ** 2 + RELMSE_EPSILON
-            products.append((shown * shown_by_other).mean(axis=1) / denominator)
-            squares.append((shown**2).mean(axis=1) / denominator)
+            products.append((own * other).mean(axis=1) / denominator)
+            squares.append((own**2).mean(axis=1) / denominator)
         slopes = _sure_slopes(*(np.concatenate(values) for values in (octaves_apart, products, squares)))
         for half, place in enumerate(places):
             share = np.interp(octaves_apart[half], _OCTAVES, slopes).astype(np.float32)[:, None]
@@ -67,7 +67,7 @@ def _level(image: FloatImage) -> FloatImage:
 
 
 def _sure_slopes(octaves_apart: FloatImage, p: _Floats, q: _Floats) -> _Floats:
-    """Return, for each of `_OCTAVES`, which part of the difference of pixels so far apart is surely true."""
+    """Return, for each of `_OCTAVES`, the certain part of the difference of pixels that far apart."""
     rung = np.searchsorted(_OCTAVES, octaves_apart, side="right") - 1
 
     def sum_beyond(values: _Floats) -> _Floats:
@@ -80,6 +80,6 @@ def _sure_slopes(octaves_apart: FloatImage, p: _Floats, q: _Floats) -> _Floats:
     sure = np.clip(slopes - _SURELY * np.sqrt(np.maximum(residuals, 0)) / total, 0, 1)
     sure[sum_beyond(np.ones_like(q)) < _FEW] = 0
     sure[0] = 0
-    # What is true of some pixels is true of those yet farther apart.
+    # What is certain of some pixels holds for those yet farther apart.
     accumulated: _Floats = np.maximum.accumulate(sure)
     return accumulated

@@ -1,4 +1,4 @@
-"""What a fit leaves behind beside the image: a network that later frames start from, or use as it is."""
+"""The network that a fit returns beside the image: later frames start from it, or use it as it is."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Weights = dict[str, npt.NDArray[np.float32]]
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A fitted network and all that it takes to use it on another image.
+    """A fitted network and all that is needed to use it on another image.
 
     ``kind`` pointwise is the network of the presets draft, balanced and final: it chooses pixel by pixel
     among the pilots of ``layout``, and its inputs are standardised with constants of the image that it was
@@ -48,34 +48,34 @@ class Model:
 
 
 def source_sha256(buffers: RenderBuffers) -> str:
-    """Return what tells one noisy image from another."""
+    """Return the SHA-256 of the colour (float32, row by row), which identifies a noisy image."""
     return hashlib.sha256(np.ascontiguousarray(buffers.color.mean).data).hexdigest()
 
 
 def check_settings(model: Model, settings: FitSettings) -> None:
-    """Raise InputError that names the difference if the settings ask for another network than the model's."""
+    """Raise InputError that names the difference if the settings are not those of the model's network."""
     names = ("preset", "pilot", *(PAPER_SETTINGS if settings.preset == "paper" else ()))
     for name in names:
-        expected, asked = getattr(model.settings, name), getattr(settings, name)
-        if asked != expected:
+        expected, chosen = getattr(model.settings, name), getattr(settings, name)
+        if chosen != expected:
             raise InputError(
-                f"the model was fitted with {name} {_text(expected)}, this fit asks for {_text(asked)}; "
-                f"ask for {_text(expected)}, or fit without the model"
+                f"the model was fitted with {name} {_text(expected)}, this fit is to use {_text(chosen)}; "
+                f"choose {_text(expected)}, or fit without the model"
             )
 
 
 def check_planes(model: Model, planes: tuple[str, ...]) -> None:
-    """Raise InputError that names the difference if an image's planes are not those that the model sees."""
+    """Raise InputError that names the difference if an image's planes are not the model's inputs."""
     if planes == model.planes:
         return
     missing = [name for name in model.planes if name not in planes]
     unknown = [name for name in planes if name not in model.planes]
     differences = [
-        f"{what} {', '.join(names)}" for what, names in (("lacks", missing), ("adds", unknown)) if names
+        f"{verb} {', '.join(names)}" for verb, names in (("lacks", missing), ("adds", unknown)) if names
     ]
+    what = " and ".join(differences) or "has the planes in another order"
     raise InputError(
-        f"the input does not fit the model: it {' and '.join(differences) or 'orders the planes otherwise'}; "
-        f"render the same buffers, or fit without the model"
+        f"the input does not fit the model: it {what}; render the same buffers, or fit without the model"
     )
 
 

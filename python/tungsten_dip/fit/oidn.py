@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise, which was trained on many images: a peer to compare with, and a guide.
+"""Intel Open Image Denoise, which was trained on many images: a denoiser to compare with, and a pilot.
 
 https://www.openimagedenoise.org, through the package ``pyoidn``, on the CPU.
 """
@@ -35,12 +35,12 @@ def oidn_image(
     quality: Quality = "high",
     threads: int | None = None,
 ) -> FloatImage:
-    """Return what Open Image Denoise makes of one image, in its HDR mode.
+    """Denoise one image with Open Image Denoise, in its HDR mode.
 
     All images are float32 of shape (height, width, 3): linear radiance, albedo (clipped to [0, 1] in there)
-    and normals in [-1, 1], as noisy as they were rendered. Values that are not finite are mended first, the
-    arguments are not modified. Normals are of use to it beside an albedo alone; without one they are left
-    out, and the log says so. ``threads`` None uses every core. The result is finite linear radiance.
+    and normals in [-1, 1], as noisy as they were rendered. Values that are not finite are repaired first;
+    the arguments are not modified. It uses normals only together with an albedo; without one they are left
+    out, and the log reports it. ``threads`` None uses every core. The result is finite linear radiance.
 
     Raises InputError if the image is empty, the shapes differ, pyoidn is not installed, or the processor is
     not one that Open Image Denoise supports.
@@ -51,7 +51,7 @@ def oidn_image(
     import pyoidn
 
     if normal is not None and albedo is None:
-        _LOG.info("Open Image Denoise takes normals only beside an albedo: the normals are left out")
+        _LOG.info("Open Image Denoise uses normals only together with an albedo: the normals are left out")
         normal = None
     color_buffer = Buffer(np.ascontiguousarray(color))
     features = {
@@ -59,8 +59,8 @@ def oidn_image(
         for name, feature in (("albedo", albedo), ("normal", normal))
         if feature is not None
     }
-    mended, _ = sanitize(RenderBuffers(color_buffer).with_quantities(**features), threads)
-    images = {name: buffer.mean for name, buffer in mended.quantities()}
+    repaired, _ = sanitize(RenderBuffers(color_buffer).with_quantities(**features), threads)
+    images = {name: buffer.mean for name, buffer in repaired.quantities()}
     images["output"] = np.empty_like(images["color"])
     qualities = {
         "fast": pyoidn.OIDN_QUALITY_FAST,

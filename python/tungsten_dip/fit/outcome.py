@@ -1,4 +1,4 @@
-"""What becomes of a network's output: the image, its error, and whether it is better than its input."""
+"""Makes the result from a network's output: the image, its error, and whether it is better than the input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, exposure, unscaled
-from tungsten_dip.fit.lost_detail import with_what_was_lost
+from tungsten_dip.fit.lost_detail import with_lost_detail
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 
 _ERROR_RADIUS = 4
@@ -23,10 +23,10 @@ _BIAS = 1.5
 """What the squared bias is to the median squared difference of the pilots from the result, about."""
 
 _CONFIDENCE = 4.0
-"""An estimate may lie so many standard errors above what the halves tell."""
+"""An estimate may lie so many standard errors above the error estimated from the halves."""
 
 _SURE = 0.35
-"""Relative standard error of an estimated relMSE up to which it is believed."""
+"""Relative standard error of an estimated relMSE up to which it is used."""
 
 _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
@@ -38,7 +38,7 @@ _CONVERGED = 1e-5
 def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: Clock) -> FitResult | None:
     """Return the image as it is if its halves hardly differ, else None.
 
-    Copies do not differ at all: they tell something only if the variance, too, says that there is no noise.
+    Copies do not differ at all: they count as free of noise only if the variance confirms it.
     """
     color = buffers.color
     if color.halves is None:
@@ -46,10 +46,10 @@ def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: C
     a, b = color.halves
     squared = color.mean.astype(np.float64) ** 2
     noise = (a - b).astype(np.float64) ** 2 / 4
-    # Dark images are not taken for clean ones.
+    # Dark images are not mistaken for clean ones.
     bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
-    told = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
-    if max(told) >= _CONVERGED or told == [0]:
+    estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
+    if max(estimated) >= _CONVERGED or estimated == [0]:
         return None
     relative = np.minimum(noise / (squared + RELMSE_EPSILON), _LARGEST_ERROR)
     error = channel_mean(relative.astype(np.float32))
@@ -70,11 +70,11 @@ def estimate_error(
 ) -> FloatArray:
     """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
 
-    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs made of one half each,
-    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
-    is (fused_a - fused_b)^2 / 4 in the mean. Its bias is not known; it is taken for `_BIAS` times the median
-    squared difference of f and the pilots, which blur in different ways, or for less if the noisy halves do
-    not allow as much in the mean (see `_told_by_halves`).
+    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs for one half each, shape
+    (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
+    (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured; it is estimated as `_BIAS` times the
+    median squared difference of f and the pilots, which blur in different ways, or less if the noisy halves
+    imply a smaller mean error (see `_error_from_halves`).
     """
     output = np.float32(0.5) * (fused_a + fused_b)
     epsilon = _epsilon_of_renderer(scale)
@@ -92,9 +92,9 @@ def estimate_error(
             ]
             variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
             bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
-    told, standard_error = _told_by_halves(pilots[0], fused_a, fused_b, epsilon)
+    estimated, standard_error = _error_from_halves(pilots[0], fused_a, fused_b, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
-    allowed = max(told + _CONFIDENCE * standard_error - least, 0.0)
+    allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
@@ -110,31 +110,31 @@ def _relative(squared: FloatArray, denominator: FloatArray) -> FloatArray:
 
 
 def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: FloatArray) -> float:
-    """Return the mean of the same error as the other half tells it: without bias, but noisy.
+    """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
-    exposure. Told by the noisy halves or, where those leave too large a standard error, by the smallest
+    exposure. Estimated from the noisy halves or, where their standard error is too large, from the smallest
     pilot, far less noisy but a little blurred.
     """
     epsilon = np.float32(RELMSE_EPSILON)
-    for witnesses in pilots[:2]:
-        mean, standard_error = _told_by_halves(witnesses, fused_a, fused_b, epsilon)
+    for targets in pilots[:2]:
+        mean, standard_error = _error_from_halves(targets, fused_a, fused_b, epsilon)
         if standard_error < _SURE * mean:
             break
     relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
     return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
 
 
-def _told_by_halves(
-    witnesses: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
+def _error_from_halves(
+    targets: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
 ) -> tuple[float, float]:
-    """Return the mean error that independent witnesses tell, and its standard error.
+    """Return the mean error estimated from independent targets, and its standard error.
 
-    With witnesses a, b of truth x and outputs f_a, f_b made of one half each, E (f_a - b)^2 is the error of
-    f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of one
-    output; the mean of two has half of that.
+    With targets a, b (noisy images of the truth) and outputs f_a, f_b for one half each, E (f_a - b)^2 is the
+    error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of
+    one output; the mean of two has half of that.
     """
-    a, b = (image.reshape(-1, 3) for image in witnesses)
+    a, b = (image.reshape(-1, 3) for image in targets)
     crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
     error = channel_mean(_relative(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
     spread = float(error.std(dtype=np.float64))
@@ -151,13 +151,13 @@ def result_from_fused(
     history: Sequence[HistoryPoint],
     notes: Sequence[str],
 ) -> FitResult:
-    """Make the result of what the network made of each half, or of the input if that is as good.
+    """Make the result from the network's outputs for both halves, or from the input if that is as good.
 
-    ``whole`` is what its weights for both halves, in the mean, make of all samples.
+    ``whole`` are the pilots of all samples, blended with the mean of both halves' weights.
     """
     threads = evidence.threads
     shape = fused[0].shape
-    fused = with_what_was_lost(evidence.halves, fused)
+    fused = with_lost_detail(evidence.halves, fused)
     fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
     image = np.float32(0.5) * (fused[0] + fused[1])
     if whole is not None:
@@ -169,8 +169,8 @@ def result_from_fused(
     squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     notes = [*evidence.notes, *notes]
-    told, _ = _told_by_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
-    if told >= error_of_input:
+    estimated, _ = _error_from_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
+    if estimated >= error_of_input:
         notes.append("the input is as good as anything fitted to it, and is returned")
         image, fused = evidence.mean, evidence.halves
         epsilon = _epsilon_of_renderer(evidence.scale)

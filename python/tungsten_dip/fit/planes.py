@@ -1,9 +1,9 @@
-"""What the network of the presets draft, balanced and final sees of an image, and how much its pixels count.
+"""The inputs of the network of the presets draft, balanced and final, and the weights of its loss.
 
-Planes say of every pixel what its features are, what the pilots say, and how well each pilot of one half
+Planes contain every pixel's features, the brightness of its pilots, and how well each pilot of one half
 predicts the other half in the pixels around it: never in the pixel itself, whose noise it is scored by (the
-blind spot of Krull et al. 2019, "Noise2Void"). The scores of two neighbours together tell that noise all the
-same, which is why the network sees one pixel at a time.
+blind spot of Krull et al. 2019, "Noise2Void"). The scores of two neighbours together do depend on
+that noise, which is why the network's input is one pixel.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LARGEST_INPUT = 4.0
 # What the planes are made with is part of every saved network (`onnx.file` numbers the format): errors are
 # relative to the squared radiance, brightness is in units of the evidence.
 _LOG_OFFSET = 0.02
-"""Added before a logarithm: brightnesses far below are not told apart."""
+"""Added before a logarithm: brightnesses far below are not distinguished."""
 
 _LEAST_ERROR = 1e-4
 """Smaller errors, 1% of the radiance, do not differ."""
@@ -59,7 +59,7 @@ _LEAST_NOISE = 1.0
 def loss_weights(evidence: Evidence) -> Halves:
     """Return how much the squared error of each half's pixels counts, shape (height, width, 1).
 
-    Relative to what the half itself says, never to the half that scores it: a pixel must not count less
+    Relative to pilots of the half itself, never to the half that scores it: a pixel must not count less
     because the noise that it is compared with is bright, or the image would darken.
     """
     denominators = denominators_of(evidence.smooth)
@@ -72,7 +72,7 @@ def loss_weights(evidence: Evidence) -> Halves:
 
 
 def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
-    """Yield what the network sees of one half, plane by plane, each of shape (height, width).
+    """Yield the network's inputs for one half, plane by plane, each of shape (height, width).
 
     A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
     """
@@ -92,11 +92,11 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     for index, pilot in enumerate(evidence.pilots):
         if index == layout.reference:
             continue
-        shown = pilot[half]
+        image = pilot[half]
         if index == 0:
-            # Its own noise aside: else a noisy pixel is chosen for being dark by chance.
-            shown = np.maximum(mean_around(shown, 1, threads), 0)
-        yield np.clip(_log_level(shown) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
+            # Without the pixel's own noise: else a noisy pixel is chosen for being dark by chance.
+            image = np.maximum(mean_around(image, 1, threads), 0)
+        yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
         worse = np.minimum(squared_error(pilot[half], other, denominator), cap) - reference
         for radius in SCORE_RADII:
             unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
@@ -120,7 +120,7 @@ def network_inputs(evidence: Evidence) -> FloatArray:
 
 @dataclass(frozen=True)
 class Standardisation:
-    """What brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
+    """Brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
 
     mean: npt.NDArray[np.float64]
     std: FloatArray

@@ -1,7 +1,7 @@
 """The network that chooses among pilots, pixel by pixel, and its training.
 
-It may be several networks of one shape, its members, that start from different weights and see the same
-examples; their mean errs less than each of them.
+It may be several networks of one shape, its members, that start from different weights and use the same
+examples; the error of their mean is below that of each.
 
 A training step (forward, loss, gradients and the update of Adam, Kingma and Ba 2015) is one ONNX graph of
 plain operators. For a network as small as this one onnxruntime takes less time than torch, and loads in a
@@ -29,7 +29,7 @@ ADAM_BETAS = (0.9, 0.999)
 ADAM_EPSILON = 1e-8
 
 _RUN_PIXELS = 1 << 14
-"""Pixels that the network sees at once: what its layers leave stays in the processor's cache."""
+"""Pixels that the network processes at once: the outputs of its layers stay in the processor's cache."""
 
 
 @dataclass(frozen=True)

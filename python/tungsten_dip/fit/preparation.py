@@ -1,4 +1,4 @@
-"""What every way to denoise an image does with its input first, and with its result at the end."""
+"""What every fit and every model does with its input first, and with its result at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Prepared:
-    """Sanitised buffers, what somebody else knows of the image, and notes on what was mended."""
+    """Sanitised buffers, images that the caller supplies, and notes on repaired values."""
 
     buffers: RenderBuffers
     candidates: tuple[Halves, ...]
@@ -34,7 +34,7 @@ def prepared(
     previous: Halves | None = None,
     threads: int | None = None,
 ) -> Prepared:
-    """Check and mend what is to be denoised; the arguments are those of `tungsten_dip.denoise`.
+    """Check and sanitise the input; the arguments are those of `tungsten_dip.denoise`.
 
     Raises InputError if the image is empty, or candidates are of another shape or not finite.
     """
@@ -42,20 +42,20 @@ def prepared(
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     if not any(np.isfinite(plane).any() for _, plane in buffers.color.planes()):
         _LOG.warning(
-            "the colour is NaN or Inf in every pixel: the picture will show next to nothing; render it again"
+            "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
     given = checked_candidates(buffers, candidates)
     previous = checked_previous(buffers, previous)
     buffers, foreign = without_foreign_halves(buffers)
-    buffers, mended = sanitize(buffers, threads)
-    return Prepared(buffers, given, previous, (*foreign, *mended))
+    buffers, repaired = sanitize(buffers, threads)
+    return Prepared(buffers, given, previous, (*foreign, *repaired))
 
 
 def finished(result: FitResult, known: Prepared) -> FitResult:
     """Return the result with the notes on its input before its own, all of which are logged.
 
-    Where alpha and colour of the input are 0 the result is black: light without coverage would glow around
-    whatever the picture is laid over.
+    Where alpha and colour of the input are 0 the result is black: radiance without coverage would glow around
+    the image that it is composited over.
     """
     result = replace(result, notes=(*known.notes, *result.notes))
     for note in result.notes:

@@ -1,4 +1,4 @@
-"""What a fit is asked to do, and what it gives back."""
+"""The settings of a fit, and its result."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _MOST_CHANNELS = 4096
 class FitSettings:
     """Settings of one fit. None means: as the preset has it.
 
-    ``pilot`` names a denoiser that somebody else trained, as one more guess that the halves judge like the
-    others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and ``channels``
+    ``pilot`` names a pre-trained denoiser, as one more pilot that the halves score like the others: Open
+    Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and ``channels``
     describe the network of the published method and are used by the preset ``paper`` alone. ``target_error``
     is a relMSE (epsilon 0.01). ``threads`` None uses every core.
 
@@ -64,7 +64,7 @@ class FitSettings:
                 continue
             if not _is_whole(value, least, most):
                 raise InputError(f"{name}: expected a whole number from {least} to {most}, got {value!r:.40}")
-            object.__setattr__(self, name, int(value))  # of numpy's numbers JSON knows nothing
+            object.__setattr__(self, name, int(value))  # JSON cannot represent numpy's numbers
         for name in ("time_budget_s", "target_error"):
             value = getattr(self, name)
             if value is None:
@@ -94,7 +94,7 @@ def _is_whole(value: object, least: int, most: int) -> bool:
 
 @dataclass(frozen=True)
 class HistoryPoint:
-    """Where a fit stood: what it had cost and how good it knew itself to be."""
+    """A point of a fit: the time and steps so far, and the estimated error."""
 
     seconds: float
     iteration: int
@@ -103,17 +103,17 @@ class HistoryPoint:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """A denoised image and what is known about it.
+    """A denoised image, its estimated error, and the fitted network.
 
-    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is the relMSE
-    (with epsilon 0.01) that it is believed to have, and ``error`` tells where: the relative squared error
-    around every pixel, shape (height, width, 1), the mean over 9x9 pixels. ``halves`` is what was made of
-    half A of the samples alone and of half B alone, in the units and shape of ``color``, which is their mean
-    with the preset draft, and with the others moved from it towards what all samples say. These are None with
-    the preset paper. ``halves_drawn`` tells that the image came without independent halves, which were drawn
-    from it (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
-    ``interrupted`` tells that Ctrl-C ended the fit early. ``notes`` says in one line each what evidence was
-    missing and what that meant.
+    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is its estimated
+    relMSE (with epsilon 0.01), and ``error`` the estimated relative squared error around every pixel, shape
+    (height, width, 1), the mean over 9x9 pixels. ``halves`` are the results of half A of the samples alone
+    and of half B alone, in the units and shape of ``color``, which is their mean with the preset draft, and
+    with the others moved from it towards the pilots of all samples. These are None with the preset paper.
+    ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it
+    (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
+    ``interrupted`` indicates that Ctrl-C ended the fit early. ``notes`` are one line each, for example on
+    missing buffers.
     """
 
     color: FloatImage

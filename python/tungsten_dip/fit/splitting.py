@@ -33,8 +33,8 @@ _LEAST_SHAPE = 1e-2
 """One half has nearly all of such a pixel: a single sample was so bright."""
 
 _STRAY = 8 / 3
-"""Emission so many times the mean of the 8 pixels around was seen by chance: a lamp's corner has three lit
-neighbours."""
+"""Emission of more than so many times the mean of the 8 pixels around was hit by chance: a lamp's corner has
+three lit neighbours."""
 
 _LEAST_SHAPE_OF_LAMPS = 8.0
 """Hardly any half has less than a quarter of the other one's light."""
@@ -48,30 +48,30 @@ def with_independent_halves(
 ) -> tuple[RenderBuffers, tuple[Halves, ...], tuple[str, ...]]:
     """Return sanitised buffers with independent halves of the colour, candidates that these can score, notes.
 
-    Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is told by
-    how far pixels are from those around. Then no candidate can be used: whoever made it knew all of the
-    noise. The same image and seed give the same halves, whatever the exposure.
+    Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is estimated
+    from the difference of pixels and their surroundings. Then no candidate can be used: it was computed from
+    the noise of both halves. The same image and seed give the same halves, whatever the exposure.
     """
     color = buffers.color
     test = halves_independent(buffers, threads)
-    # Of tiny or plain images nothing tells, and halves are what they are called unless they are copies.
-    untold = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
-    if test.independent or untold:
+    # Tiny or uniform images cannot be tested: their halves are used unless they are copies.
+    untestable = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
+    if test.independent or untestable:
         return buffers, candidates, ()
     emitted = np.zeros_like(color.mean)
     if buffers.albedo is not None:
         emitted = np.maximum(buffers.albedo.mean - 1, 0)
     share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
     notes = [
-        f"{_why(buffers, test)}: its noise, as the pixels around tell it, is split at random into two; the "
-        f"estimated error may be too low"
+        f"{_why(buffers, test)}: its noise, estimated from the surrounding pixels, is split at random into "
+        f"two; the estimated error may be too low"
     ]
     if candidates:
-        notes.append("the candidates are not used: what made them knew both halves of the noise")
+        notes.append("the candidates are not used: they were computed from the noise of both halves")
     split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
     albedo = buffers.albedo
     if albedo is not None and emitted.any():
-        # What lights emit the colour shows, too, and with the same noise.
+        # The colour contains the emitted light, too, and with the same noise.
         surfaces = (np.minimum(half, 1) for half in albedo.halves_or_mean)
         half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
         variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
@@ -80,14 +80,14 @@ def with_independent_halves(
 
 
 def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:
-    """Return T, shape (height, width, 1), drawn as the noise around a pixel asks for."""
+    """Return T, shape (height, width, 1), drawn according to the noise around a pixel."""
     image = scaled(color, exposure(color))
     drawn = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
     around = _core.box_mean(image, _MEAN_RADIUS, threads)
     apart = _sum_of_squares(image - around).astype(np.float32)[:, :, None]
     noise = _core.box_mean(apart, _NOISE_RADIUS, threads)[:, :, 0].astype(np.float64)
     shape = np.clip(_sum_of_squares(around) / np.maximum(noise, 1e-30), _LEAST_SHAPE, _LARGEST_SHAPE)
-    # The edges of a lamp in plain view pass for noise, but no half may be without it.
+    # The edges of a lamp in plain view are mistaken for noise, but no half may be without it.
     level = channel_mean(emitted)
     lit = (level > 0) & (level <= np.float32(_STRAY) * mean_around(level, 1, threads))
     shape[lit[:, :, 0]] = np.maximum(shape[lit[:, :, 0]], _LEAST_SHAPE_OF_LAMPS)

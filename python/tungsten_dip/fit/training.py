@@ -38,8 +38,8 @@ _POOL_PASSES = 4
 _LEAST_BATCH = 64
 _LEAST_COUNT = 1 << 12
 _BATCH_GROWTH = 4 / 3
-"""A step sees `_LEAST_BATCH` pixels where both halves have `_LEAST_COUNT`, and with more of them more, up to
-what the preset says: at 512x288 all of that."""
+"""A step uses `_LEAST_BATCH` pixels where both halves have `_LEAST_COUNT`, and more on larger images, up to
+the number of the preset, which 512x288 pixels reach."""
 
 _HISTORY_EVERY = 20
 _PROBE_PIXELS = 1 << 15
@@ -49,7 +49,7 @@ _PROBE_SHARE = 8
 """One pixel in this many at most is set aside."""
 
 _STRANGE = 0.5
-"""A model knows nothing of an image of which this part of a plane is clipped at `LARGEST_INPUT`."""
+"""A model is not used on an image of which more than this part of a plane is clipped at `LARGEST_INPUT`."""
 
 _WARM_RATE = 0.3
 """A network that starts near its goal takes steps this many times as long."""
@@ -62,7 +62,7 @@ _WARM_GAIN = 0.01
 
 @dataclass(frozen=True)
 class Start:
-    """What a training starts from; ``warm`` where that is a network which knows another image."""
+    """What a training starts from; ``warm`` if from the weights of a network fitted to another image."""
 
     evidence: Evidence
     examples: Examples
@@ -73,9 +73,9 @@ class Start:
 
 
 def start_of_training(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
-    """Return the examples, and the weights of ``model`` or, where that knows no such images, new ones.
+    """Return the examples, and the weights of ``model`` or, if its image was too different, new ones.
 
-    New ones are those of so many ``members`` (`fit.pointwise`).
+    New weights are those of so many ``members`` (`fit.pointwise`).
     """
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()
@@ -84,7 +84,7 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None, member
         far_out = [float((np.abs(plane) >= LARGEST_INPUT).mean()) for plane in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
             return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
-        notes = ("the model knows no such images: a network is fitted anew",)
+        notes = ("the image is too unlike the model's: a new network is fitted",)
         evidence = with_best_reference(evidence)
         inputs = network_inputs(evidence)
     standardisation = standardisation_of(inputs, evidence.threads)
@@ -139,8 +139,8 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
     """Yield ``size`` of both halves' examples at a time, or as many as there are, without end.
 
-    ``trained`` are the pixels that they may show; they are drawn with replacement. Of small images every step
-    sees less than in proportion, or the network would learn their noise: PSNR at 64x36 rises by 3 dB.
+    ``trained`` are the pixels that they are drawn from, with replacement. On small images every step uses
+    less than in proportion, or the network would learn their noise: PSNR at 64x36 rises by 3 dB.
     """
     count, pixels = 2 * len(trained), len(examples.inputs) // 2
     size = min(size, count, max(_LEAST_BATCH, round(_LEAST_BATCH * (count / _LEAST_COUNT) ** _BATCH_GROWTH)))
@@ -195,8 +195,8 @@ def train(
 
     Every step uses at most ``batch_pixels`` pixels, drawn at random (see `_batches`).
 
-    After a warm start, the network is done once the error of pixels that are not trained on, as the halves
-    tell it, falls no further.
+    After a warm start, training stops once the error of pixels that are not trained on, estimated from the
+    halves, falls no further.
     """
     rng = np.random.default_rng(settings.seed)
     threads = start.evidence.threads
@@ -246,7 +246,7 @@ def train(
                 break
     except KeyboardInterrupt:
         done.interrupted = True
-        done.notes.append(f"interrupted at step {done.steps_done}: the image is what was reached by then")
+        done.notes.append(f"interrupted at step {done.steps_done}: the image is the one reached by then")
     if stopping is not None:
         network.load(stopping.weights)
     return done

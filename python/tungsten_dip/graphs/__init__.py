@@ -1,1 +1,1 @@
-"""ONNX graphs: built node by node, and run by onnxruntime. Nothing here knows of networks or images."""
+"""ONNX graphs: built node by node, and run by onnxruntime."""

@@ -18,7 +18,7 @@ Dims = Sequence[int | str]
 
 
 class GraphBuilder:
-    """Gathers nodes and constants; values are known by their names."""
+    """Collects nodes and constants; values are identified by their names."""
 
     def __init__(self) -> None:
         self._nodes: list[onnx.NodeProto] = []

@@ -1,4 +1,4 @@
-"""Models as ONNX files, and files that nobody has to trust.
+"""Models as ONNX files, which may come from an untrusted source.
 
 A file holds the graph, its weights, and one metadata property in JSON. Reading it takes the weights and the
 property alone: the graph that runs is always built anew from them, and a file whose own graph is another one
@@ -32,16 +32,16 @@ from tungsten_dip.onnx.graph import graph_of
 
 LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
-"""All but the weights: bounds what a parser makes of them."""
+"""Of all but the weights: bounds the memory of the parser."""
 
 _FORMAT = 3
-"""Raised whenever another graph is written, or the same one sees other planes."""
+"""Raised whenever another graph is written, or the same one has other planes as inputs."""
 
 _PROPERTY = "tungsten_dip"
 _SETTINGS = ("preset", "pilot", "iterations", "network", "inputs", "scheme", "channels", "seed")
-"""The settings that say what a network is; the others say where and how long it was fitted."""
+"""The settings that determine a network; the others, where and how long it was fitted, are not saved."""
 
-_NO_ONNX = "expected an ONNX model, this is none or cut short; save it anew with --save-model"
+_NO_ONNX = "expected an ONNX model, found another file or a truncated one; save it again with --save-model"
 _MOST_PARTS = 1 << 16
 _LARGEST_COUNT = 1 << 16
 _LARGEST_RADIUS = 64
@@ -73,7 +73,7 @@ def load_model(path: str | Path) -> Model:
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
-            raise InputError(f"{path}: expected a file, this is none")
+            raise InputError(f"{path}: expected a file, found a folder or device")
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE_BYTES + 1)
     except OSError as error:
@@ -176,7 +176,7 @@ def _parts(message: memoryview, budget: Iterator[int]) -> Iterator[tuple[int, me
 def _facts(proto: onnx.ModelProto) -> dict[str, Any]:
     texts = [p.value for p in proto.metadata_props if p.key == _PROPERTY]
     if len(texts) != 1:
-        raise InputError("expected a model that tungsten-dip wrote, this is another one; use --save-model")
+        raise InputError("expected a model that tungsten-dip wrote, found another one; use --save-model")
     try:
         facts = json.loads(texts[0], parse_constant=_no_constant)
     except (ValueError, RecursionError):
@@ -205,13 +205,13 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
     if kind == "pointwise":
         layout = _layout(_object("layout", facts.get("layout")))
         if layout.planes != planes:
-            raise InputError("the planes are not those of the pilots; this version names them otherwise")
+            raise InputError("the planes are not those of the pilots; this version has other names for them")
         mean, std = (_array(tensors.pop(n, None), n, dtype) for n, dtype in (("mean", "f8"), ("std", "f4")))
         if not (std > 0).all():
             raise InputError("std: expected numbers above 0")
         standardisation = Standardisation(mean.ravel(), std.ravel())
     elif settings.network != kind:
-        raise InputError(f"expected the network {settings.network}, as the settings say, found {kind}")
+        raise InputError(f"expected the network {settings.network}, as in the settings, found {kind}")
     if (settings.preset == "paper") != (kind != "pointwise"):
         raise InputError(f"expected another network with the preset {settings.preset} than {kind}")
     # Other initializers are constants of the graph, which the comparison of the graphs checks.
@@ -256,7 +256,7 @@ def _object(name: str, value: Any) -> dict[str, Any]:
 
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
-    """Return a value of JSON as what a type hint asks for."""
+    """Return a value of JSON as the type of a hint."""
     if get_origin(hint) is tuple:
         if isinstance(value, list) and len(value) <= _LARGEST_COUNT:
             return tuple(_checked(name, item, get_args(hint)[0]) for item in value)
@@ -304,7 +304,7 @@ def _check_same(found: onnx.ModelProto, expected: onnx.ModelProto) -> None:
     operators = [[node.op_type for node in proto.graph.node] for proto in (found, expected)]
     what = "it differs in its constants or attributes"
     if domains != [""]:
-        what = f"it asks for operators of the domains {domains!r:.60}"
+        what = f"it uses operators of the domains {domains!r:.60}"
     elif found.functions or found.training_info or found.graph.sparse_initializer:
         what = "it holds functions, training information or sparse weights"
     elif operators[0] != operators[1]:

@@ -1,6 +1,6 @@
 """The graphs of the networks: what `fit.pointwise` and `fit.published.networks` compute, in plain operators.
 
-The height and width of the inputs are free. A batch holds images that know nothing of one another: the batch
+The height and width of the inputs are free. The images of a batch are independent: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
 """
 
@@ -218,7 +218,7 @@ class _Network(GraphBuilder):
         return x
 
     def cropped(self, x: str) -> None:
-        """Give out as many rows and columns as came in."""
+        """Crop the output to the height and width of the inputs."""
         size = self.add("Shape", "inputs", start=2, end=4)
         self.add("Slice", x, self.integers(0, 0), size, self.integers(2, 3), output="color")
 

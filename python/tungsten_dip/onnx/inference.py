@@ -1,4 +1,4 @@
-"""Denoise with a network that is fitted already."""
+"""Denoise with a fitted network."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tungsten_dip.progress import Progress, silent
 
 _BAND_PIXELS = 1 << 18
 _RUN_PIXELS = 1 << 13
-"""Pixels that the network sees at once: what its layers leave stays in the processor's cache."""
+"""Pixels that the network processes at once: the outputs of its layers stay in the processor's cache."""
 
 
 def infer(
@@ -44,8 +44,8 @@ def infer(
     ``buffers``, ``candidates`` and ``previous`` are as in `tungsten_dip.denoise`; the features, and how many
     candidates, are those of the fit. ``threads`` None uses every core. With ``refit_steps``, a pointwise
     network is first trained further on this image, as by a warm start, for so many steps at most; the
-    result's ``model`` is then the refined one. A network of the preset paper gives the image by itself, and
-    no error is known.
+    result's ``model`` is then the refined one. A network of the preset paper outputs the image itself, and
+    its error is not estimated.
 
     Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
     refit_steps cannot be done.
@@ -68,7 +68,7 @@ def infer(
 
 
 def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:
-    # When to stop was said of the model's own fit. (A FitSettings checks the threads as well.)
+    # When to stop was a setting of the model's own fit. (A FitSettings checks the threads as well.)
     return replace(
         model.settings,
         threads=threads,
@@ -115,7 +115,7 @@ def infer_fusion(
 def _fused(
     model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage]
 ) -> tuple[Halves, FloatImage | None]:
-    """Return what the network makes of both halves, and of all samples if given, band by band of rows."""
+    """Return the blended pilots of both halves and, if given, of all samples, computed band by band."""
     # Both halves are computed side by side; the network is too small to share.
     session = session_from_proto(graph_of(model), 1)
     height, width = evidence.mean.shape[:2]
@@ -136,10 +136,10 @@ def _fused(
                 inputs[index, : end - first] = plane[first - above : end - above]
             for row in range(first, end, rows_at_once):
                 part = slice(row, min(row + rows_at_once, end))
-                seen = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
+                planes = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
                 for image, images in zip(fused, choices, strict=True):
                     pilots = np.stack([pilot[part].transpose(2, 0, 1) for pilot in images])[None]
-                    color = session.run(["color"], {"inputs": seen, "pilots": pilots})[0]
+                    color = session.run(["color"], {"inputs": planes, "pilots": pilots})[0]
                     check_finite(color)
                     image[part] = color[0].transpose(1, 2, 0)
         return fused

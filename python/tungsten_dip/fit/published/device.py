@@ -20,9 +20,9 @@ def check_torch_device(device: str) -> None:
 
 @contextmanager
 def compute_device(settings: FitSettings) -> Iterator[torch.device]:
-    """Yield the device that the settings ask for, with their number of threads set meanwhile.
+    """Yield the device of the settings; meanwhile, torch uses their number of threads.
 
-    Raises InputError if the device is not there.
+    Raises InputError if torch cannot compute on the device.
     """
     check_torch_device(settings.device)
     use_cuda = settings.device != "cpu" and torch.cuda.is_available()

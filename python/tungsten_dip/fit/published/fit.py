@@ -65,7 +65,7 @@ class PaperFit:
         self._input = _nchw(fixed.to(device, dtype))
         self._noisy_input = torch.empty_like(self._input)
         # Drawing every value anew would cost more than the network's first layer. The noise of an iteration
-        # is a window of this pool at a place drawn anew, so that no pixel sees the same value twice but by
+        # is a window of this pool at a place drawn anew, so that a pixel gets the same value twice only by
         # chance.
         pool_size = fixed.numel() + _NOISE_WINDOWS * _NOISE_STRIDE
         self._noise_pool = torch.randn(pool_size, generator=generator).to(device, dtype)
@@ -99,9 +99,11 @@ class PaperFit:
         with self._precision:
             output = self.network(self._noisy_input).float()
         loss = F.mse_loss(output, self._wanted)
-        seen = output.detach()
+        detached = output.detach()
         self.loss = loss.item()
-        color_loss = self.loss if seen.shape[1] == 3 else F.mse_loss(seen[:, :3], self._wanted[:, :3]).item()
+        color_loss = (
+            self.loss if detached.shape[1] == 3 else F.mse_loss(detached[:, :3], self._wanted[:, :3]).item()
+        )
         self.psnr = -10 * math.log10(max(color_loss, 1e-12))
         if not self.psnr >= self._last_good_psnr - BACKTRACK_DB:
             self._weights.copy_(self._good_weights)
@@ -109,9 +111,9 @@ class PaperFit:
         self._good_weights.copy_(self._weights)
         self._last_good_psnr = self.psnr
         if self._average is None:
-            self._average = seen.clone()
+            self._average = detached.clone()
         else:
-            self._average.lerp_(seen, 1 - AVERAGE_WEIGHT)
+            self._average.lerp_(detached, 1 - AVERAGE_WEIGHT)
 
         self._optimizer.zero_grad(set_to_none=False)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -207,9 +209,9 @@ def _notes_on_method(buffers: RenderBuffers, settings: FitSettings) -> list[str]
     if settings.pilot != "none":
         notes.append("pilot is not used: the published method fits the colour alone")
     if settings.target_error is not None:
-        notes.append("target_error is not used: the published method cannot tell its error")
+        notes.append("target_error is not used: the published method cannot estimate its error")
     if settings.scheme == "ioc":
-        notes.append("scheme ioc: the input is random, whatever inputs says")
+        notes.append("scheme ioc: the input is random, and inputs is not used")
     return notes
 
 

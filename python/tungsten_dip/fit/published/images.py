@@ -28,11 +28,11 @@ _GAMMA = 2.2
 
 @dataclass(frozen=True)
 class PaperImages:
-    """``given`` is shown to the network beside ``random_channels``; its output is compared with ``wanted``.
+    """``given`` is the network's input beside ``random_channels``, ``wanted`` the training target.
 
     Both are float32 in [0, 1], shape (height, width, channels). ``names`` are those of the channels of
-    ``given``. The first three channels of ``wanted`` are the colour. ``notes`` says in one line each what was
-    missing or left out.
+    ``given``. The first three channels of ``wanted`` are the colour. ``notes`` are one line on each
+    quantity that was missing or left out.
     """
 
     given: FloatImage
@@ -48,7 +48,7 @@ class PaperImages:
 
 
 def network_input(images: PaperImages, seed: int) -> FloatImage:
-    """Return what the network sees: fixed random channels, then the given ones."""
+    """Return the network's input, (height, width, channels): fixed random channels, then the given ones."""
     shape = (*images.given.shape[:2], images.random_channels)
     random = np.random.default_rng(seed).random(shape, np.float32) * np.float32(RANDOM_INPUT_SCALE)
     return np.concatenate([random, images.given], axis=2)
@@ -71,8 +71,8 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     (``ioc``): only random channels go in, colour and all features come out. ``all`` holds the noisy colour
     too. Channels of one value carry nothing and are left out.
 
-    Raises InputError if a feature that was asked for by name is missing, a value is NaN, or nothing at all
-    would go in.
+    Raises InputError if a feature that ``settings.inputs`` names is missing, a value is NaN, or no input
+    channel is left.
     """
     color = ldr_from_radiance(buffers.color.mean)
     features = {"color": color} if settings.scheme == "iic" and settings.inputs.startswith("all") else {}
@@ -119,7 +119,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
 
 
 def _ldr_from_feature(quantity: str, buffer: Buffer) -> dict[str, FloatImage]:
-    """Every known plane of a feature as three channels in [0, 1]."""
+    """Return every plane that a feature has as three channels in [0, 1]."""
     images = {}
     for plane, values in buffer.planes():
         if plane != "variance" and quantity == "normal":

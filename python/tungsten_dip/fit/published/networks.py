@@ -161,7 +161,7 @@ def _image(bits: npt.NDArray[np.uint16], shape: torch.Size) -> Tensor:
 
 
 class _MirroringConv(nn.Conv2d):
-    """A 3x3 convolution that sees the image mirrored at its edges."""
+    """A 3x3 convolution with the image mirrored at its edges."""
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__(in_channels, out_channels, 3, stride)
@@ -192,8 +192,8 @@ class _Side(nn.Sequential):
 class _Up(nn.Module):
     """Double the resolution: upsample bilinearly, join what comes in, norm, 3x3, norm, act, 1x1, norm, act.
 
-    Where nothing comes in, as at the fine scales, the 3x3 convolution sees the edge repeated in place of
-    mirrored. Upsampling and convolution are then together one convolution of the coarse image, with one
+    Where nothing comes in, as at the fine scales, the 3x3 convolution repeats the edge in place of mirroring
+    it. Upsampling and convolution are then together one convolution of the coarse image, with one
     kernel for each of the four pixels that a coarse pixel becomes: no large image in between.
     """
 
