@@ -16,6 +16,7 @@ from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.report.metrics import relative_squared_error
+from tungsten_dip.report.preview import block_means
 
 BLOCK = 8
 
@@ -54,11 +55,8 @@ def _row(bench_set: BenchSet, settings: FitSettings, ratio: float) -> str:
 
 
 def _ranks(image: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
-    """Rank blocks of `BLOCK` pixels each way by their means; those cut by the far borders are left out."""
-    rows, columns = (size // BLOCK for size in image.shape)
-    whole = image[: rows * BLOCK, : columns * BLOCK]
-    means = whole.reshape(rows, BLOCK, columns, BLOCK).mean(axis=(1, 3))
-    return np.argsort(np.argsort(means, axis=None))
+    """Rank blocks of `BLOCK` pixels each way by their means."""
+    return np.argsort(np.argsort(block_means(image, BLOCK), axis=None))
 
 
 if __name__ == "__main__":

@@ -8,3 +8,16 @@ Progress = Callable[[float, str], None]
 
 def silent(fraction: float, message: str) -> None:
     """Report to nobody."""
+
+
+def part_of(progress: Progress, start: float, end: float, name: str) -> Progress:
+    """Return the callback of one part of the work, which takes the fractions from ``start`` to ``end``.
+
+    The messages of the part follow ``name``.
+    """
+
+    def report(fraction: float, message: str) -> None:
+        done = (1 - fraction) * start + fraction * end
+        progress(done, f"{name}: {message}" if message else name)
+
+    return report

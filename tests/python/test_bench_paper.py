@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from tungsten_dip.bench import paper_table  # noqa: E402
+from tungsten_dip.bench import methods, paper_table  # noqa: E402
 from tungsten_dip.bench.iteration import _convolutions, time_iterations, times_text  # noqa: E402
 from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve  # noqa: E402
 from tungsten_dip.bench.paper_table import SCENES, published_rows, run_paper_table  # noqa: E402
@@ -88,7 +88,7 @@ def curves(monkeypatch):
         begun.append(settings)
         return paper_curve(buffers, settings, checkpoints, progress)
 
-    monkeypatch.setattr(paper_table, "paper_curve", counted)
+    monkeypatch.setattr(methods, "paper_curve", counted)
     return begun
 
 
@@ -126,7 +126,7 @@ def test_some_rows_can_be_chosen_and_go_on_after_an_interrupt(bench_set, curves,
 
     choice = {"iterations": 2, "rows": (2, 9), "figure": False, "threads": 1}
     with monkeypatch.context() as patch:
-        patch.setattr(paper_table, "paper_curve", interrupted)
+        patch.setattr(methods, "paper_curve", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run_paper_table(bench_set, tmp_path, **choice)
     run_paper_table(bench_set, tmp_path, **choice)

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.errors import InputError
-from tungsten_dip.report.metrics import compare, display_from_linear, relative_squared_error
+from tungsten_dip.report.metrics import compare, relative_squared_error
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_relative_squared_error_keeps_the_shape():
 
 def test_display_clips_and_applies_the_gamma():
     image = np.array([[[-1.0, 0.5, 7.0]]], dtype=np.float32)
-    np.testing.assert_allclose(display_from_linear(image), [[[0, 0.5 ** (1 / 2.2), 1]]], rtol=1e-6)
+    np.testing.assert_allclose(ldr_from_radiance(image), [[[0, 0.5 ** (1 / 2.2), 1]]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +108,7 @@ def test_display_clips_and_applies_the_gamma():
 def test_flip_of_uniform_images_is_the_published_colour_difference(color, reference):
     # Filters leave uniform images as they are, and there are no edges or points in them.
     images = [np.full((40, 40, 3), each, dtype=np.float32) for each in (color, reference)]
-    displayed = [display_from_linear(image)[0, 0].astype(np.float64) for image in images]
+    displayed = [ldr_from_radiance(image)[0, 0].astype(np.float64) for image in images]
     assert compare(*images).flip == pytest.approx(flip_of_colors(*displayed), abs=2e-3)
 
 

@@ -132,7 +132,8 @@ def check_paper(fit: Model, network: Any, size: tuple[int, int]) -> None:
 
 
 def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None:
-    from tungsten_dip.fit.published.images import network_input, paper_images, radiance_from_ldr
+    from tungsten_dip.buffers.display import radiance_from_ldr
+    from tungsten_dip.fit.published.images import network_input, paper_images
     from tungsten_dip.fit.published.networks import Skip
 
     fit = paper_model("skip", frame.buffers)

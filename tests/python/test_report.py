@@ -8,7 +8,7 @@ from browser import assert_page_works
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
 from tungsten_dip.report.page import _features, _round_ticks, report_page
-from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, error_in_false_color, side_by_side
+from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, block_means, error_in_false_color, side_by_side
 
 VOID = {"meta", "img", "input", "line", "circle", "polyline", "link", "br"}
 
@@ -174,3 +174,17 @@ def test_the_page_works_in_a_browser(render, result, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(report_page("A room with " + "a_long_name" * 9, render.buffers, result, "filmic"))
     assert_page_works(path)
+
+
+@pytest.mark.parametrize("shape", [(6, 4, 3), (7, 5, 3), (7, 5)])
+def test_block_means_leave_out_what_fills_no_block(shape: tuple[int, ...]) -> None:
+    image = np.random.default_rng(0).random(shape)
+    means = block_means(image, 2)
+    assert means.shape == (3, 2, *shape[2:])
+    np.testing.assert_allclose(means[2, 1], image[4:6, 2:4].mean(axis=(0, 1)))
+
+
+def test_a_side_shorter_than_a_block_is_one_block() -> None:
+    image = np.arange(6.0).reshape(1, 6, 1)
+    np.testing.assert_array_equal(block_means(image, 4)[..., 0], [[1.5]])
+    np.testing.assert_array_equal(block_means(image, 1), image)

@@ -124,6 +124,22 @@ def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]
     return methods
 
 
+def paper_method(
+    bench_set: BenchSet, settings: FitSettings, counts: Sequence[int], label_of: Callable[[int], str]
+) -> Method:
+    """Return one fit of the published method, with an outcome after each of the iterations ``counts``."""
+
+    def run(repeat: int, progress: Progress) -> list[Outcome]:
+        return [
+            Outcome(label_of(p.iteration), p.color, p.seconds, p.iteration, p.loss, p.psnr_noisy)
+            for p in paper_curve(bench_set.buffers, settings, counts, progress)
+        ]
+
+    labels = tuple(label_of(count) for count in counts)
+    marks = tuple(map(str, counts))
+    return Method(PAPER, labels, marks, settings_text(settings), run, pictured=labels[-1:])
+
+
 def settings_text(settings: FitSettings) -> str:
     """Return the settings that are not the default, ``preset=draft threads=2``."""
     default = FitSettings()
@@ -163,7 +179,9 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None) -> Iterator[Me
             mark = f"{budget_s:g} s"
             yield _ours(bench_set, IN_TIME, f"final in {mark}", mark, settings, pictured=False)
     if "paper" in plan.kinds:
-        yield _paper(bench_set, FitSettings("paper", threads=plan.threads), plan.paper_iterations)
+        counts = checkpoints_up_to(plan.paper_iterations)
+        settings = FitSettings("paper", threads=plan.threads)
+        yield paper_method(bench_set, settings, counts, lambda count: f"paper, {count} iterations")
     if "oidn" in plan.kinds:
         for quality in get_args(Quality):
             yield _oidn(bench_set, quality, plan.threads)
@@ -188,22 +206,6 @@ def _ours(
 
     shown = (label,) if pictured else ()
     return Method(series, (label,), (mark,), settings_text(settings), run, pictured=shown)
-
-
-def _paper(bench_set: BenchSet, settings: FitSettings, iterations: int) -> Method:
-    counts = checkpoints_up_to(iterations)
-    label_of = {count: f"paper, {count} iterations" for count in counts}
-
-    def run(repeat: int, progress: Progress) -> list[Outcome]:
-        points = paper_curve(bench_set.buffers, settings, counts, progress)
-        return [
-            Outcome(label_of[p.iteration], p.color, p.seconds, p.iteration, p.loss, p.psnr_noisy)
-            for p in points
-        ]
-
-    labels = tuple(label_of.values())
-    marks = tuple(map(str, counts))
-    return Method(PAPER, labels, marks, settings_text(settings), run, pictured=labels[-1:])
 
 
 def _oidn(bench_set: BenchSet, quality: Quality, threads: int | None) -> Method:

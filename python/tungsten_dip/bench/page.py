@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from html import escape
 
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip.bench.methods import NOISY, OURS
 from tungsten_dip.bench.plot import legend_html, pareto_svgs
@@ -15,10 +14,9 @@ from tungsten_dip.buffers import FloatImage
 from tungsten_dip.report import parts
 from tungsten_dip.report.metrics import relative_squared_error
 from tungsten_dip.report.parts import Picture, View
-from tungsten_dip.report.preview import error_in_false_color
-from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.report.preview import block_means, error_in_false_color
+from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP, display_from_radiance
 
-TONEMAP = "gamma"
 DETAILS = 2
 DETAIL_FRACTION = 1 / 6
 """Side of a detail over the shorter side of the picture."""
@@ -46,8 +44,10 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     yield parts.table(COLUMNS, [cells(row) for row in each.rows], 1, each.front())
 
     images = {row.label: row.image for row in each.rows if row.image is not None}
-    pictures = [Picture("reference", display_from_radiance(each.bench_set.reference, TONEMAP))]
-    pictures += [Picture(label, display_from_radiance(image, TONEMAP)) for label, image in images.items()]
+    pictures = [Picture("reference", display_from_radiance(each.bench_set.reference, DEFAULT_TONEMAP))]
+    pictures += [
+        Picture(label, display_from_radiance(image, DEFAULT_TONEMAP)) for label, image in images.items()
+    ]
     denoised = [p.pixels for p in pictures if p.label not in ("reference", NOISY)]
     corners = _details(denoised or [p.pixels for p in pictures])
     side = _detail_side(pictures[0].pixels)
@@ -109,9 +109,5 @@ def _details(pictures: Sequence[FloatImage]) -> list[tuple[int, int]]:
 def _error_map(image: FloatImage, reference: FloatImage) -> FloatImage:
     """Return the relative squared error of blocks of pixels; values that are not finite count as black."""
     finite = np.where(np.isfinite(image), image, np.float32(0))
-    error: npt.NDArray[np.float64] = relative_squared_error(finite, reference).mean(axis=2)
-    block = max(error.shape[1] // MAP_WIDTH_PX, 1)
-    height, width = (size // block * block for size in error.shape)
-    if block > 1 and height > 0:
-        error = error[:height, :width].reshape(height // block, block, width // block, block).mean((1, 3))
-    return error[..., None].astype(np.float32)
+    error = relative_squared_error(finite, reference).mean(axis=2, keepdims=True)
+    return block_means(error, max(error.shape[1] // MAP_WIDTH_PX, 1)).astype(np.float32)

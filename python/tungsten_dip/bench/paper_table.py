@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from tungsten_dip.bench.machine import machine_facts
-from tungsten_dip.bench.methods import PAPER, Method, Outcome, settings_text
-from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
+from tungsten_dip.bench.methods import Method, paper_method
+from tungsten_dip.bench.paper_curve import checkpoints_up_to
 from tungsten_dip.bench.plot import require_matplotlib, write_iterations_plot
 from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.runner import Runner, Task
@@ -172,27 +172,14 @@ def _can_be_fitted(bench_set: BenchSet, row: PublishedRow, settings: FitSettings
 
 def _row_method(bench_set: BenchSet, row: PublishedRow, iterations: int, threads: int | None) -> Method:
     label = f"row {row.number}"
-    return _method(bench_set, row.settings(iterations, threads), (iterations,), lambda count: label)
+    return paper_method(bench_set, row.settings(iterations, threads), (iterations,), lambda count: label)
 
 
 def _curve_method(bench_set: BenchSet, iterations: int, threads: int | None) -> Method:
     total = max(round(iterations * TOO_MANY), iterations + 1)
     counts = checkpoints_up_to(total, first=min(10, iterations))
     settings = FitSettings("paper", threads=threads)
-    return _method(bench_set, settings, counts, lambda count: f"after {count} iterations")
-
-
-def _method(
-    bench_set: BenchSet, settings: FitSettings, counts: Sequence[int], label_of: Callable[[int], str]
-) -> Method:
-    def run(repeat: int, progress: Progress) -> list[Outcome]:
-        return [
-            Outcome(label_of(p.iteration), p.color, p.seconds, p.iteration, p.loss, p.psnr_noisy)
-            for p in paper_curve(bench_set.buffers, settings, counts, progress)
-        ]
-
-    labels = tuple(label_of(count) for count in counts)
-    return Method(PAPER, labels, labels, settings_text(settings), run)
+    return paper_method(bench_set, settings, counts, lambda count: f"after {count} iterations")
 
 
 def _markdown(

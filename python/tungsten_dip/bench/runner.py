@@ -15,7 +15,7 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.buffers import FloatImage, read_image, write_image, write_text
 from tungsten_dip.errors import InputError
 from tungsten_dip.interrupts import heeded_interrupts
-from tungsten_dip.progress import Progress
+from tungsten_dip.progress import Progress, part_of
 from tungsten_dip.report.metrics import compare
 
 
@@ -59,12 +59,8 @@ class Runner:
     def run(self, tasks: Sequence[Task], progress: Progress) -> None:
         """Run the tasks in turn. KeyboardInterrupt loses the task in hand and no other."""
         for index, task in enumerate(tasks):
-
-            def part(
-                fraction: float, message: str, done: int = index, what: str = task.method.labels[-1]
-            ) -> None:
-                progress((done + fraction) / len(tasks), f"{what}: {message}")
-
+            start, end = index / len(tasks), (index + 1) / len(tasks)
+            part = part_of(progress, start, end, task.method.labels[-1])
             part(0, task.bench_set.name)
             with heeded_interrupts():
                 outcomes = task.method.run(task.repeat, part)

@@ -8,7 +8,7 @@ left the scene).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,10 +59,10 @@ class Buffer:
 
     def planes(self) -> Iterator[tuple[str, FloatImage]]:
         """Yield (name, array) for every array that is known, in the order of the fields."""
-        for name in ("mean", "half_a", "half_b", "variance"):
-            array = getattr(self, name)
+        for plane in fields(self):
+            array = getattr(self, plane.name)
             if array is not None:
-                yield name, array
+                yield plane.name, array
 
 
 @dataclass(frozen=True, eq=False)

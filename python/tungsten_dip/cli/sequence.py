@@ -25,6 +25,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.errors import InputError
 from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -34,9 +35,6 @@ if TYPE_CHECKING:
     from tungsten_dip.sequence.work import Record
 
 log = logging.getLogger(__name__)
-
-TONEMAP = "gamma"
-"""How the page shows frames: Tungsten's default."""
 
 
 _TOLD_OF_EVERY_FRAME = tuple(
@@ -195,7 +193,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
 def _write_report(path: Path, title: str, records: Sequence[Record]) -> None:
     from tungsten_dip.sequence.page import sequence_page
 
-    write_text(path, sequence_page(title, records, TONEMAP))
+    write_text(path, sequence_page(title, records, DEFAULT_TONEMAP))
 
 
 def _refit(text: str) -> int | str:

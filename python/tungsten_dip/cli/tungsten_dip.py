@@ -48,11 +48,9 @@ from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs, Preset
 from tungsten_dip.remarks import remarks_from_log
+from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
-
-TONEMAP = "gamma"
-"""How saved buffers are displayed: Tungsten's default."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -203,7 +201,7 @@ def _denoised(
         result = denoise(buffers)
     write_denoised(options.output, result, buffers, half=options.half)
     if options.report is not None:
-        write_report(options.report, options.input.name, buffers, result, TONEMAP, remarks)
+        write_report(options.report, options.input.name, buffers, result, DEFAULT_TONEMAP, remarks)
     if options.error_map is not None:
         assert result.error is not None
         write_image(options.error_map, result.error)

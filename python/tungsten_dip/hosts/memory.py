@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from tungsten_dip.buffers.image_file import MAX_PIXELS
 from tungsten_dip.buffers.model import CHANNELS
 from tungsten_dip.errors import InputError
-from tungsten_dip.scene.parse import MAX_PIXELS
 from tungsten_dip.scene.types import Scene
 
 TUNGSTEN_BYTES_PER_PIXEL = 240

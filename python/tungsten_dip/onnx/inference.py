@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError
@@ -17,7 +18,7 @@ from tungsten_dip.fit.model import Model, check_finite, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import finished, prepared
-from tungsten_dip.fit.published.images import network_input, paper_images, radiance_from_ldr
+from tungsten_dip.fit.published.images import network_input, paper_images
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto

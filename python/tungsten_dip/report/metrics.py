@@ -10,13 +10,12 @@ from importlib.util import find_spec
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _LOG = logging.getLogger(__name__)
-
-DISPLAY_GAMMA = 2.2
 
 _METRIC_BY_PACKAGE = {"skimage": "SSIM", "flip_evaluator": "FLIP"}
 
@@ -74,7 +73,7 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     finite = np.isfinite(image)
     x = np.where(finite, image, 0).astype(np.float32)
     r = reference.astype(np.float32)
-    displayed_x, displayed_r = display_from_linear(x), display_from_linear(r)
+    displayed_x, displayed_r = ldr_from_radiance(x), ldr_from_radiance(r)
     reference_mean = float(r.mean(dtype=np.float64))
     return Comparison(
         psnr=_psnr(displayed_x, displayed_r),
@@ -91,12 +90,6 @@ def relative_squared_error(image: FloatImage, reference: FloatImage) -> npt.NDAr
     """Return (x - r)^2 / (r^2 + 0.01) of every value, in the shape of the images; its mean is relMSE."""
     x, r = image.astype(np.float64), reference.astype(np.float64)
     return (x - r) ** 2 / (r**2 + RELMSE_EPSILON)
-
-
-def display_from_linear(image: FloatImage) -> FloatImage:
-    """Return linear radiance as displayed for the metrics: clipped to [0, 1], gamma 2.2."""
-    clipped: FloatImage = np.clip(image, 0, 1, dtype=np.float32) ** np.float32(1 / DISPLAY_GAMMA)
-    return clipped
 
 
 def _psnr(x: FloatImage, r: FloatImage) -> float:

@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FEATURES, FloatImage, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
 from tungsten_dip.report import parts
@@ -61,7 +62,7 @@ def _features(buffers: RenderBuffers) -> Iterator[Picture]:
         if name == "color":
             continue
         if name == "albedo":
-            values = display_from_radiance(values, "gamma")
+            values = ldr_from_radiance(values)
         elif name == "normal":
             values = np.float32(0.5) * (values + 1)
         elif name == "depth":

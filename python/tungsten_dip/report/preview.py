@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatImage
 
@@ -11,6 +14,20 @@ GAP_PX = 4
 
 FALSE_COLORS = ((0, 0, 4), (66, 15, 117), (147, 38, 103), (221, 81, 58), (252, 165, 10), (252, 255, 164))
 """8-bit colours from no error to the most: dark to light, so that they read in grey too."""
+
+
+def block_means(image: npt.NDArray[np.floating[Any]], size: int) -> npt.NDArray[np.floating[Any]]:
+    """Return the means of blocks of ``size`` x ``size`` pixels, for an image of shape (height, width, ...).
+
+    Rows and columns that do not fill a block are left out; a side shorter than ``size`` is one block.
+    """
+    rows, columns = (max(1, length // size) for length in image.shape[:2])
+    whole = image[: rows * size, : columns * size]
+    height, width, *channels = whole.shape
+    means: npt.NDArray[np.floating[Any]] = whole.reshape(
+        rows, height // rows, columns, width // columns, *channels
+    ).mean(axis=(1, 3))
+    return means
 
 
 def side_by_side(left: FloatImage, right: FloatImage) -> FloatImage:

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
+from tungsten_dip.buffers.image_file import MAX_PIXELS
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file, shown
 from tungsten_dip.scene.metals import ETA_AND_K
@@ -54,9 +55,6 @@ from tungsten_dip.scene.types import (
 )
 
 logger = logging.getLogger(__name__)
-
-MAX_PIXELS = 2**28
-"""Largest image accepted; whether there is memory for it, a host says that renders it."""
 
 MAX_NESTED_BSDFS = 256
 """BSDFs that one BSDF may be made of, counting what it names as often as it does.

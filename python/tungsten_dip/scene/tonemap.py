@@ -7,9 +7,13 @@ from typing import get_args
 
 import numpy as np
 
+from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import TonemapName
+
+DEFAULT_TONEMAP: TonemapName = "gamma"
+"""Tungsten's default."""
 
 # Every curve is flat up here; beyond it the squares in the filmic one would overflow.
 _SATURATED = np.float32(1e6)
@@ -32,12 +36,8 @@ def _linear(light: FloatImage) -> FloatImage:
     return light
 
 
-def _gamma(light: FloatImage) -> FloatImage:
-    return np.power(light, 1.0 / 2.2)
-
-
 def _reinhard(light: FloatImage) -> FloatImage:
-    return np.power(light / (light + 1.0), 1.0 / 2.2)
+    return ldr_from_radiance(light / (light + 1.0))
 
 
 def _filmic(light: FloatImage) -> FloatImage:
@@ -53,7 +53,7 @@ def _pbrt(light: FloatImage) -> FloatImage:
 
 _CURVES: dict[str, Callable[[FloatImage], FloatImage]] = {
     "linear": _linear,
-    "gamma": _gamma,
+    "gamma": ldr_from_radiance,
     "reinhard": _reinhard,
     "filmic": _filmic,
     "pbrt": _pbrt,

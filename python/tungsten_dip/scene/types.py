@@ -11,6 +11,7 @@ on column vectors, and are read-only.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -761,9 +762,11 @@ class Camera:
 
     In ``world_from_local`` the camera looks along +z, +y is up and +x points to the right of the picture:
     Tungsten negates the x axis of the transform in the file for that. ``resolution`` is (width, height).
+    ``pixel_center`` is where in a pixel Tungsten centres its reconstruction filter.
     """
 
     kind: ClassVar[str] = ""
+    pixel_center: ClassVar[float] = 0.5
     tonemap: TonemapName = "gamma"
     resolution: tuple[int, int] = (1000, 563)
     reconstruction_filter: FilterName = "tent"
@@ -772,17 +775,28 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PinholeCamera(Camera):
-    """Everything in focus. ``fov`` is horizontal."""
+class PerspectiveCamera(Camera):
+    """A pinhole or a thin lens before a flat picture. ``fov`` is horizontal."""
 
-    kind: ClassVar[str] = "pinhole"
-    world_from_local: Transform = field(default_factory=default_pinhole_frame)
     fov: Fov = 60.0
+
+    @property
+    def plane_distance(self) -> float:
+        """The distance of the picture plane, on which the width of the picture is 2."""
+        return 1 / math.tan(math.radians(self.fov) / 2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ThinlensCamera(Camera):
-    """Depth of field. ``fov`` is horizontal; ``aperture_size`` is the radius of the lens.
+class PinholeCamera(PerspectiveCamera):
+    """Everything in focus."""
+
+    kind: ClassVar[str] = "pinhole"
+    world_from_local: Transform = field(default_factory=default_pinhole_frame)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ThinlensCamera(PerspectiveCamera):
+    """Depth of field. ``aperture_size`` is the radius of the lens.
 
     ``focus_distance`` is measured along the axis; where ``focus_pivot`` names a primitive, it is the distance
     to that. Tungsten's thin lens samples a pixel about its upper left corner, not about its middle as the
@@ -790,7 +804,7 @@ class ThinlensCamera(Camera):
     """
 
     kind: ClassVar[str] = "thinlens"
-    fov: Fov = 60.0
+    pixel_center: ClassVar[float] = 0.0
     focus_distance: Positive = 1.0
     focus_pivot: str = ""
     aperture_size: NotNegative = 0.001

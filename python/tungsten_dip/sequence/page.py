@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.buffers.read import read_image
 from tungsten_dip.report import parts
 from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.parts import Picture
+from tungsten_dip.report.preview import block_means
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.sequence.work import Record
 
@@ -68,16 +68,8 @@ def _strip(done: Sequence[Record], tonemap: str) -> Iterator[Picture]:
     chosen = np.unique(np.linspace(0, len(done) - 1, min(len(done), _MOST_PICTURES)).round().astype(int))
     for record in (done[index] for index in chosen if done):
         color = read_image(Path(record.output))
-        yield Picture(f"frame {record.number}", display_from_radiance(_smaller(color), tonemap))
-
-
-def _smaller(image: FloatImage) -> FloatImage:
-    """Return means over squares of pixels, so that the width is at most about that of a picture."""
-    factor = max(1, round(image.shape[1] / _PICTURE_WIDTH))
-    height, width = (max(1, n // factor) for n in image.shape[:2])
-    cut = image[: height * factor, : width * factor]
-    squares = cut.reshape(height, -1, width, cut.shape[1] // width, 3)
-    return np.ascontiguousarray(squares.mean(axis=(1, 3)), np.float32)
+        smaller = block_means(color, max(1, round(color.shape[1] / _PICTURE_WIDTH)))
+        yield Picture(f"frame {record.number}", display_from_radiance(smaller.astype(np.float32), tonemap))
 
 
 def _row(record: Record) -> tuple[str, ...]:

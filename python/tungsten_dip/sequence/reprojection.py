@@ -17,7 +17,7 @@ import numpy.typing as npt
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair
 from tungsten_dip.errors import InputError
-from tungsten_dip.scene.types import Camera, PinholeCamera, ThinlensCamera
+from tungsten_dip.scene.types import Camera, PerspectiveCamera
 
 _DEPTH_TOLERANCE = 0.02
 """Relative difference of distances up to which two pixels show one surface."""
@@ -36,7 +36,7 @@ _LEAST_WEIGHT = 0.25
 
 def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
     """Raise InputError if frames cannot be moved with this camera, or it took another picture."""
-    if not isinstance(camera, PinholeCamera | ThinlensCamera):
+    if not isinstance(camera, PerspectiveCamera):
         raise InputError(
             f"camera of type {camera.kind}: expected pinhole or thinlens; leave the cameras out, frames are "
             f"then denoised without their predecessors"
@@ -63,6 +63,8 @@ def reproject(
     frame does not show what the current one does, the result is NaN.
     """
     assert current.depth is not None
+    assert isinstance(previous_camera, PerspectiveCamera)
+    assert isinstance(camera, PerspectiveCamera)
     shape = current.color.mean.shape
     depth = current.depth.mean[:, :, 0]
     points = _points(camera, depth)
@@ -92,22 +94,22 @@ def reproject(
     return moved_a.reshape(shape) * albedo_a, moved_b.reshape(shape) * albedo_b
 
 
-def _points(camera: Camera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _points(camera: PerspectiveCamera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the camera's position, and the way from there to what every pixel shows (length 1 for sky)."""
     height, width = depth.shape
     frame = np.asarray(camera.world_from_local, np.float64)
     # Tungsten's PinholeCamera::sampleDirection: x from -1 to 1 over the width, the plane at 1 / tan(fov / 2).
     ray = np.empty((height, width, 3), np.float32)
-    ray[:, :, 0] = (np.arange(width) + _pixel_center(camera)) * 2 / width - 1
-    ray[:, :, 1] = (height / width - (np.arange(height) + _pixel_center(camera)) * 2 / width)[:, None]
-    ray[:, :, 2] = _plane_distance(camera)
+    ray[:, :, 0] = (np.arange(width) + camera.pixel_center) * 2 / width - 1
+    ray[:, :, 1] = (height / width - (np.arange(height) + camera.pixel_center) * 2 / width)[:, None]
+    ray[:, :, 2] = camera.plane_distance
     ray /= np.sqrt(np.einsum("...i,...i", ray, ray))[:, :, None]
     world = ray @ _rotation(camera).T.astype(np.float32)
     return frame[:3, 3].astype(np.float32), world * np.where(depth > 0, depth, 1)[:, :, None]
 
 
 def _seen_from(
-    camera: Camera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_], part: slice
+    camera: PerspectiveCamera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_], part: slice
 ) -> tuple[FloatArray, ...]:
     """Return where a camera sees points, in pixels (far outside if behind it), and how far from it they are.
 
@@ -121,9 +123,9 @@ def _seen_from(
     local = (way + hit[:, None] * offset) @ _rotation(camera).astype(np.float32)
     x, y, z = local.T
     before = z > 0
-    scale = np.where(before, _plane_distance(camera) / np.where(before, z, 1), np.nan) * np.float32(width / 2)
-    column = np.where(before, x * scale + width / 2 - _pixel_center(camera), -2 * width)
-    row = np.where(before, height / 2 - y * scale - _pixel_center(camera), -2 * height)
+    scale = np.where(before, camera.plane_distance / np.where(before, z, 1), np.nan) * np.float32(width / 2)
+    column = np.where(before, x * scale + width / 2 - camera.pixel_center, -2 * width)
+    row = np.where(before, height / 2 - y * scale - camera.pixel_center, -2 * height)
     return column, row, np.where(hit, np.sqrt(np.einsum("ij,ij->i", local, local)), 0)
 
 
@@ -184,13 +186,3 @@ def _rotation(camera: Camera) -> npt.NDArray[np.float64]:
     # A scaled frame scales neither the picture nor the distances along its rays.
     rotation: npt.NDArray[np.float64] = columns / np.linalg.norm(columns, axis=0)
     return rotation
-
-
-def _plane_distance(camera: Camera) -> float:
-    assert isinstance(camera, PinholeCamera | ThinlensCamera)
-    return float(1 / np.tan(np.radians(camera.fov) / 2))
-
-
-def _pixel_center(camera: Camera) -> float:
-    # Tungsten's thin lens centres its filter on a pixel's corner (`scene.types.ThinlensCamera`).
-    return 0.0 if isinstance(camera, ThinlensCamera) else 0.5

@@ -21,7 +21,7 @@ from tungsten_dip.buffers.source import OWN
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.progress import Progress, silent
+from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.sequence.following import Follower, Models, Refit
 from tungsten_dip.sequence.frames import Frame
@@ -115,11 +115,11 @@ def denoise_frames(
     frames = list(frames)
     records: list[Record] = []
     for index, frame in enumerate(frames):
+        start, end = index / len(frames), (index + 1) / len(frames)
+        part = part_of(progress, start, end, f"frame {frame.number}")
         beside = bool(records) and records[-1].error is None and not records[-1].skipped
         try:
-            record = finished(frame, run) or _denoise(
-                frame, run, follower, beside, _part(progress, index, len(frames), frame)
-            )
+            record = finished(frame, run) or _denoise(frame, run, follower, beside, part)
         except (InputError, OSError) as error:
             record = failed(frame, error)
         records.append(record)
@@ -174,9 +174,3 @@ def _key(frame: Frame, run: Run) -> str:
     asked = (settings, run.refit, run.mapping, run.half, run.warm_start)
     facts: list[Any] = [stats, *asked, metadata.version("tungsten-dip")]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-
-
-def _part(progress: Progress, index: int, count: int, frame: Frame) -> Progress:
-    return lambda fraction, message: progress(
-        (index + fraction) / count, f"frame {frame.number}{', ' + message if message else ''}"
-    )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
@@ -23,7 +24,6 @@ RANDOM_INPUT_SCALE = 0.1
 _QUANTITY_FROM_INPUTS = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
 _QUANTITIES = ("normal", "albedo", "depth")
 _PLANES = ("mean", "half_a", "half_b", "variance")
-_GAMMA = 2.2
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,6 @@ def network_input(images: PaperImages, seed: int) -> FloatImage:
     shape = (*images.given.shape[:2], images.random_channels)
     random = np.random.default_rng(seed).random(shape, np.float32) * np.float32(RANDOM_INPUT_SCALE)
     return np.concatenate([random, images.given], axis=2)
-
-
-def ldr_from_radiance(radiance: FloatImage) -> FloatImage:
-    """Clip linear radiance to [0, 1] and apply gamma 2.2."""
-    return np.clip(radiance, 0, 1) ** np.float32(1 / _GAMMA)
-
-
-def radiance_from_ldr(ldr: FloatImage) -> FloatImage:
-    """Undo `ldr_from_radiance`, but for what it clipped."""
-    return ldr ** np.float32(_GAMMA)
 
 
 def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:

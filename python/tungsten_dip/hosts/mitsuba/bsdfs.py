@@ -10,8 +10,9 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 from tungsten_dip.hosts.mitsuba.textures import UV, slopes_node, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant
 from tungsten_dip.scene import types as ts
+from tungsten_dip.scene.types import Matrix
 
 _LOG = logging.getLogger(__name__)
 

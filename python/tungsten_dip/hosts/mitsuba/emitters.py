@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
 from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
+from tungsten_dip.scene.types import Matrix
 
 Surrounding = ts.InfiniteSphere | ts.InfiniteSphereCap | ts.Skydome
 """What lights a scene from infinitely far away."""

@@ -21,7 +21,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
-from tungsten_dip.progress import Progress, silent
+from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.types import Scene
 
 _log = logging.getLogger(__name__)
@@ -118,9 +118,8 @@ def render_translated(
                 break
             pass_spp = min(spp - done_spp, spp if timeout_s is None else spp_step)
             pass_seed = int(np.random.SeedSequence([seed, done_spp]).generate_state(1)[0])
-            pixels = _render_pass(
-                mitsuba, scene, pass_spp, pass_seed, _part(progress, done_spp, pass_spp, spp)
-            )
+            part = part_of(progress, done_spp / spp, (done_spp + pass_spp) / spp, f"{spp} spp")
+            pixels = _render_pass(mitsuba, scene, pass_spp, pass_seed, part)
             for name, rendered in _statistics(pixels, quantities).items():
                 statistics[name] = statistics[name].merged(rendered) if name in statistics else rendered
             done_spp += pass_spp
@@ -157,10 +156,6 @@ def _scene_with_integrator(
         **{f"albedo_{bsdf}": texture for bsdf, texture in translated.albedo.items()},
     }
     return {**translated.scene, "integrator": integrator}
-
-
-def _part(progress: Progress, done_spp: int, pass_spp: int, spp: int) -> Progress:
-    return lambda fraction, _: progress((done_spp + fraction * pass_spp) / spp, f"{spp} spp")
 
 
 def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progress) -> FloatImage:

@@ -6,8 +6,6 @@ to the right. Tungsten's field of view is horizontal.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from tungsten_dip.hosts.mitsuba.media import medium_object
@@ -24,7 +22,7 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
     Raises InputError for a type of camera or a lens without counterpart.
     """
     t.place = f"camera of type {camera.kind}"
-    if not isinstance(camera, ts.PinholeCamera | ts.ThinlensCamera):
+    if not isinstance(camera, ts.PerspectiveCamera):
         raise t.unsupported("this camera")
     width, height = camera.resolution
     node: Node = {
@@ -44,15 +42,10 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
     }
     if camera.medium is not None:
         node["medium"] = medium_object(t, camera.medium)
-    if isinstance(camera, ts.PinholeCamera) or camera.aperture_size == 0.0:
+    if not isinstance(camera, ts.ThinlensCamera) or camera.aperture_size == 0.0:
         return {"type": "perspective", **node}
     lens = {"aperture_radius": camera.aperture_size, "focus_distance": camera.focus_distance}
     return {"type": "thinlens", **node, **lens}
-
-
-def pixel_center(camera: ts.Camera) -> float:
-    """Return where in a pixel Tungsten centres its filter: its thin lens takes the corner."""
-    return 0.0 if isinstance(camera, ts.ThinlensCamera) else 0.5
 
 
 def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
@@ -72,9 +65,8 @@ def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
         case _:
             raise t.unsupported(f"an aperture of type {camera.aperture.kind}")
     if camera.cateye > 0.0:
-        plane_distance = 1 / math.tan(math.radians(camera.fov) / 2)
         lens["lens_radius"] = camera.aperture_size
-        lens["diaphragm_distance"] = camera.cateye * plane_distance
+        lens["diaphragm_distance"] = camera.cateye * camera.plane_distance
     return lens
 
 

@@ -20,9 +20,10 @@ from tungsten_dip.hosts.mitsuba.bsdfs import BentShape, bsdf_object, height_map
 from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
 from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, shines, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, transform
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation, transform
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import mesh_geometry
+from tungsten_dip.scene.types import Matrix
 
 _Array = npt.NDArray[np.float64]
 

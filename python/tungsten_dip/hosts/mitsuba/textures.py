@@ -15,15 +15,16 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO
 
-from tungsten_dip.buffers.image_file import MAX_PIXELS
+from tungsten_dip.buffers.image_file import MAX_PIXELS, RADIANCE_SUFFIXES
 from tungsten_dip.errors import InputError
-from tungsten_dip.hosts.mitsuba.translation import Matrix, Node, Translation, constant, transform_uv
+from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant, transform_uv
 from tungsten_dip.scene.types import (
     BitmapTexture,
     BladeTexture,
     CheckerTexture,
     ConstantTexture,
     DiskTexture,
+    Matrix,
     Primitive,
     Skydome,
     Texture,
@@ -41,7 +42,6 @@ UV = np.eye(3)
 _Texels = npt.NDArray[np.float32]
 
 _GAMMA = (np.floor(255.0 * (np.arange(256) / 255.0) ** 2.2 + 1e-9) / 255.0).astype(np.float32)
-_HDR_SUFFIXES = {".exr", ".pfm", ".hdr"}
 _ALWAYS_WITH_ALPHA = {".png", ".jpg", ".jpeg"}  # Tungsten decodes these to four channels, whatever they hold
 _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade textures
 
@@ -187,7 +187,7 @@ def _bitmap_node(pixels: npt.NDArray[np.floating[Any]], uv: Matrix, *, clamp: bo
 
 
 def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
-    hdr = texture.file.suffix.lower() in _HDR_SUFFIXES
+    hdr = texture.file.suffix.lower() in RADIANCE_SUFFIXES
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     image = OpenImageIO.ImageInput.open(str(texture.file), config)

@@ -15,7 +15,7 @@ from tungsten_dip.hosts.mitsuba.emitters import (
     point_node,
     together,
 )
-from tungsten_dip.hosts.mitsuba.sensor import lens_of_integrator, pixel_center, sensor_node
+from tungsten_dip.hosts.mitsuba.sensor import lens_of_integrator, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.hosts.mitsuba.translation import Translation, load
@@ -67,7 +67,7 @@ def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
         t.albedo,
         integrator,
         scene.camera.reconstruction_filter,
-        pixel_center(scene.camera),
+        scene.camera.pixel_center,
         lens_of_integrator(t, scene.camera),
     )
 

@@ -8,15 +8,12 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.scene.types import Scene
+from tungsten_dip.scene.types import Matrix, Scene
 
 Node = dict[str, Any]
 """A dictionary for `mitsuba.load_dict`."""
-
-Matrix = npt.NDArray[np.float64]
 
 
 @dataclass
