@@ -11,9 +11,9 @@ from tungsten_dip.bench.methods import NOISY, OURS
 from tungsten_dip.bench.plot import legend_html, pareto_svgs
 from tungsten_dip.bench.table import COLUMNS, SetRows, cells, repeats_text
 from tungsten_dip.buffers import FloatImage
-from tungsten_dip.report import parts
+from tungsten_dip.report import html
+from tungsten_dip.report.html import Picture, View
 from tungsten_dip.report.metrics import relative_squared_error
-from tungsten_dip.report.parts import Picture, View
 from tungsten_dip.report.preview import block_means, error_in_false_color
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP, display_from_radiance
 
@@ -28,8 +28,8 @@ def pareto_page(found: Sequence[SetRows], machine: Sequence[tuple[str, str]], re
     """Return the page, which holds everything it shows."""
     names = ", ".join(each.bench_set.name for each in found)
     body = [part for each in found for part in _set_parts(each)]
-    body += ["<h2>Measured with</h2>", parts.facts(machine)]
-    return parts.page("Accuracy against time", f"{names}; {repeats_text(repeats)}", body)
+    body += ["<h2>Measured with</h2>", html.facts(machine)]
+    return html.page("Accuracy against time", f"{names}; {repeats_text(repeats)}", body)
 
 
 def _set_parts(each: SetRows) -> Iterator[str]:
@@ -41,7 +41,7 @@ def _set_parts(each: SetRows) -> Iterator[str]:
         "<p>What is worse than the noisy image is not in the plots. Set off: no faster method has a lower "
         "relMSE.</p>"
     )
-    yield parts.table(COLUMNS, [cells(row) for row in each.rows], 1, each.front())
+    yield html.table(COLUMNS, [cells(row) for row in each.rows], 1, each.front())
 
     images = {row.label: row.image for row in each.rows if row.image is not None}
     pictures = [Picture("reference", display_from_radiance(each.bench_set.reference, DEFAULT_TONEMAP))]
@@ -59,12 +59,12 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     ours = [index for index, p in enumerate(pictures) if _series(each, p.label) == OURS]
     left = next((index for index, p in enumerate(pictures) if p.label == NOISY), 0)
     yield "<h3>Side by side</h3>"
-    yield parts.comparison(pictures, left, ours[-1] if ours else len(pictures) - 1, views)
+    yield html.comparison(pictures, left, ours[-1] if ours else len(pictures) - 1, views)
 
     for index, (y, x) in enumerate(corners):
         yield f"<h3>Detail {index + 1}, where the methods differ most</h3>"
         crops = (Picture(p.label, p.pixels[y : y + side, x : x + side]) for p in pictures)
-        yield parts.gallery(crops, "crops")
+        yield html.gallery(crops, "crops")
 
     yield "<h3>Where the error is</h3><p>Relative error of every pixel against the reference.</p>"
     maps = {label: _error_map(image, each.bench_set.reference) for label, image in images.items()}
@@ -72,11 +72,11 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     if judged:
         # The median, so that one method gone astray does not turn all others black.
         most = float(np.sqrt(np.median([np.percentile(error, 99) for error in judged]))) or 1.0
-        yield parts.gallery(
+        yield html.gallery(
             Picture(f"error of {label}", error_in_false_color(error, most)[0])
             for label, error in maps.items()
         )
-        yield parts.error_scale(most)
+        yield html.error_scale(most)
 
 
 def _series(each: SetRows, label: str) -> str | None:

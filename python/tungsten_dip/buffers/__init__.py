@@ -1,13 +1,13 @@
 """Buffers of a render: the data model, files, mending, statistics of the noise, pre-filtering of features."""
 
 from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
+from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.read import read_buffers, read_image
 from tungsten_dip.buffers.sanitize import sanitize
-from tungsten_dip.buffers.statistics import HalvesTest, halves_independent
 from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 
 __all__ = [

@@ -22,7 +22,7 @@ from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, P
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 _SUFFIXES = tuple(PLANES.values())
 _CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix in _SUFFIXES} | {
@@ -169,7 +169,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
 def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) -> RenderBuffers:
     """Read one file per plane; each becomes a layer named as Tungsten names its file."""
     if ignored:
-        log.info("ignored: %s", ", ".join(ignored))
+        _LOG.info("ignored: %s", ", ".join(ignored))
     parts = {key: read_parts(file)[0] for key, file in files.items()}
     color = parts["color"]
     for key, part in parts.items():
@@ -233,17 +233,17 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
     buffers = {}
-    log.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
+    _LOG.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
     for quantity in CHANNELS:
         known = {field: quantity + suffix for field, suffix in PLANES.items() if quantity + suffix in planes}
         if "mean" in known:
             buffers[quantity] = Buffer(**{field: planes[key] for field, key in known.items()})
             taken = (f"{field} {_shown(groups[key])}" for field, key in known.items())
-            log.info("%s: %s", quantity, ", ".join(taken))
+            _LOG.info("%s: %s", quantity, ", ".join(taken))
     if "alpha" in planes:
-        log.info("alpha: %s", groups["alpha"][0])
+        _LOG.info("alpha: %s", groups["alpha"][0])
     if found.ignored:
-        log.info("ignored: %s", ", ".join(found.ignored))
+        _LOG.info("ignored: %s", ", ".join(found.ignored))
     return RenderBuffers(
         **buffers,
         spp=planes.get("spp", spp),
@@ -294,10 +294,10 @@ def _settle_variance(
         return
     if spp:
         planes["colorVariance"] = planes["colorVariance"] / np.float32(spp)
-        log.info("Variance: of one sample, divided by %g samples per pixel", spp)
+        _LOG.info("Variance: of one sample, divided by %g samples per pixel", spp)
     else:
         del planes["colorVariance"]
-        log.info("ignored: Variance, of unknown scale; if it is of the mean: --map colorVariance=Variance")
+        _LOG.info("ignored: Variance, of unknown scale; if it is of the mean: --map colorVariance=Variance")
 
 
 def _shown(names: tuple[str, ...]) -> str:

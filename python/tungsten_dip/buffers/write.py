@@ -29,7 +29,7 @@ from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 LARGEST_HALF = 65504.0
 
@@ -184,7 +184,9 @@ def _stored(label: str, image: FloatImage, half: bool) -> Channel:
     if not half:
         return image
     if np.any(np.isfinite(image) & (np.abs(image) > LARGEST_HALF)):
-        log.warning("%s has values beyond %g, the largest half float: stored as float32", label, LARGEST_HALF)
+        _LOG.warning(
+            "%s has values beyond %g, the largest half float: stored as float32", label, LARGEST_HALF
+        )
         return image
     return image.astype(np.float16)
 

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent
 from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import noise_in
-from tungsten_dip.buffers.statistics import HalvesTest, halves_independent
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.evidence import exposure, scaled
 from tungsten_dip.fit.neighbours import mean_around

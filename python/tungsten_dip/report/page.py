@@ -11,9 +11,9 @@ import numpy as np
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FEATURES, FloatImage, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
-from tungsten_dip.report import parts
+from tungsten_dip.report import html
+from tungsten_dip.report.html import Picture
 from tungsten_dip.report.line_plot import Label, Point, line_plot
-from tungsten_dip.report.parts import Picture
 from tungsten_dip.report.preview import error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
 
@@ -38,18 +38,18 @@ def report_page(
     ]
     notes = list(dict.fromkeys([*remarks, *result.notes]))
     body = [
-        parts.figures(_figures(result)),
-        parts.comparison(pictures, left=0, right=1),
+        html.figures(_figures(result)),
+        html.comparison(pictures, left=0, right=1),
         *_error_map(result),
         "<h2>Error over time</h2>",
         _curve(result.history),
-        *(("<h2>Guided by</h2>", parts.gallery(features)) if features else ()),
+        *(("<h2>Guided by</h2>", html.gallery(features)) if features else ()),
         "<h2>Settings</h2>",
-        parts.facts(_settings(result)),
+        html.facts(_settings(result)),
         "<h2>Notes</h2>",
-        parts.bullets(notes) if notes else "<p>Nothing was missing and nothing had to be mended.</p>",
+        html.bullets(notes) if notes else "<p>Nothing was missing and nothing had to be mended.</p>",
     ]
-    return parts.page(title, _subtitle(buffers), body)
+    return html.page(title, _subtitle(buffers), body)
 
 
 def _features(buffers: RenderBuffers) -> Iterator[Picture]:
@@ -102,8 +102,8 @@ def _error_map(result: FitResult) -> Iterator[str]:
         return
     picture, most = error_in_false_color(result.error)
     yield "<h2>Where the error is</h2><p>The estimated relative error of every pixel.</p>"
-    yield f'<img alt="estimated error" src="{parts.data_uri(picture)}">'
-    yield parts.error_scale(most)
+    yield f'<img alt="estimated error" src="{html.data_uri(picture)}">'
+    yield html.error_scale(most)
 
 
 def _curve(history: Sequence[HistoryPoint]) -> str:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import Curves, Mesh
 
-logger = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 _Floats = npt.NDArray[np.float32]
 _Ints = npt.NDArray[np.int64]
@@ -104,7 +104,7 @@ def read_mesh(path: Path) -> TriangleMesh:
     for name, array in (("normals", mesh.normals), ("texture coordinates", mesh.uvs)):
         bad = ~np.isfinite(array)
         if bad.any():
-            logger.warning("%s: %d %s are not finite and are taken for 0", path, int(bad.sum()), name)
+            _LOG.warning("%s: %d %s are not finite and are taken for 0", path, int(bad.sum()), name)
             array[bad] = 0.0
     return mesh
 

@@ -54,7 +54,7 @@ from tungsten_dip.scene.types import (
     Vec3,
 )
 
-logger = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 MAX_NESTED_BSDFS = 256
 """BSDFs that one BSDF may be made of, counting what it names as often as it does.
@@ -179,7 +179,7 @@ class _Parser:
                     self.missing.append(missing)
                 if family in self.named and name:
                     if name in self.named[family]:
-                        logger.warning(
+                        _LOG.warning(
                             "%s: %s: the name %s is taken; the first is used", self.path, where, shown(name)
                         )
                     self.named[family].setdefault(name, item)
@@ -195,9 +195,9 @@ class _Parser:
         self.ignored.update(shown(key)[1:-1] for key in raw if key not in parts and key not in _HARMLESS)
         if self.ignored:
             listed = ", ".join(key if n == 1 else f"{key} ({n} times)" for key, n in self.ignored.items())
-            logger.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
+            _LOG.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
         for error in self.missing:
-            logger.warning("%s (ignored: nothing uses it)", error)
+            _LOG.warning("%s (ignored: nothing uses it)", error)
         return Scene(path=self.path, input_directory=self.input_directory, **parts)
 
     # --- Values by annotation ---
@@ -447,7 +447,7 @@ class _Parser:
     def primitive_named(self, name: str, primitives: tuple[Primitive, ...], where: str) -> Primitive | None:
         found = next((primitive for primitive in primitives if primitive.name == name), None)
         if found is None:
-            logger.warning("%s: %s: no primitive is named %s; ignored", self.path, where, shown(name))
+            _LOG.warning("%s: %s: no primitive is named %s; ignored", self.path, where, shown(name))
         return found
 
 

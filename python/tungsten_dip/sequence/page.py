@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from tungsten_dip.buffers.read import read_image
-from tungsten_dip.report import parts
+from tungsten_dip.report import html
+from tungsten_dip.report.html import Picture
 from tungsten_dip.report.line_plot import Label, Point, line_plot
-from tungsten_dip.report.parts import Picture
 from tungsten_dip.report.preview import block_means
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.sequence.work import Record
@@ -33,8 +33,8 @@ def sequence_page(title: str, records: Sequence[Record], tonemap: str) -> str:
     """
     done = [record for record in records if record.error is None]
     body = [
-        parts.figures(_figures(records)),
-        parts.gallery(_strip(done, tonemap), "crops"),
+        html.figures(_figures(records)),
+        html.gallery(_strip(done, tonemap), "crops"),
         "<h2>Time</h2>",
         _plot(done, "seconds", lambda record: record.seconds),
         "<h2>Estimated relMSE</h2>",
@@ -43,9 +43,9 @@ def sequence_page(title: str, records: Sequence[Record], tonemap: str) -> str:
         f"<p>{_FLICKER_NOTE}</p>",
         _plot(done, "flicker", lambda record: record.flicker),
         "<h2>Frames</h2>",
-        parts.table(("frame", "", "seconds", "steps", "estimated relMSE", "flicker"), map(_row, records), 2),
+        html.table(("frame", "", "seconds", "steps", "estimated relMSE", "flicker"), map(_row, records), 2),
     ]
-    return parts.page(title, f"{len(records)} frames", body)
+    return html.page(title, f"{len(records)} frames", body)
 
 
 def _figures(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
