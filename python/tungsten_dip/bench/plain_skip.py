@@ -21,19 +21,17 @@ from tungsten_dip.fit.published.fit import (
     learning_rate,
 )
 
+_SKIP_CHANNELS = (0, 0, 0, 4, 4)
+"""Channels of the skip connection at each scale, from the finest on."""
+
 
 class PlainSkip(nn.Module):
     """Maps (1, in_channels, height, width), both multiples of 32, to (1, 3, height, width) in [0, 1]."""
 
-    def __init__(
-        self,
-        in_channels: int,
-        channels: tuple[int, ...] = (8, 16, 32, 64, 128),
-        skip_channels: tuple[int, ...] = (0, 0, 0, 4, 4),
-    ) -> None:
+    def __init__(self, in_channels: int, channels: tuple[int, ...] = (8, 16, 32, 64, 128)) -> None:
         super().__init__()
         self.down, self.side, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
-        for index, (count, across) in enumerate(zip(channels, skip_channels, strict=True)):
+        for index, (count, across) in enumerate(zip(channels, _SKIP_CHANNELS, strict=True)):
             source = channels[index - 1] if index else in_channels
             deeper = channels[min(index + 1, len(channels) - 1)]
             self.side.append(_block(source, across, 1) if across else nn.Identity())

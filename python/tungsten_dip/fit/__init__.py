@@ -11,11 +11,11 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.preparation import finished, prepared
-from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
 
-__all__ = ["FitResult", "FitSettings", "HistoryPoint", "check_ready", "denoise", "require_torch"]
+__all__ = ["FitResult", "FitSettings", "check_ready", "denoise", "require_torch"]
 
 
 def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Literal, get_args, get_origin, get_type_hints
 
@@ -127,4 +127,4 @@ class FitResult:
     model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()
     interrupted: bool = False
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()

@@ -1,8 +1,6 @@
 """Tungsten's scene files as typed objects, and the effects that a scene calls for."""
 
 from tungsten_dip.scene.effects import (
-    Decision,
-    Effects,
     decision_of,
     effects_of,
     inspect_facts,
@@ -12,8 +10,6 @@ from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
 
 __all__ = [
-    "Decision",
-    "Effects",
     "Scene",
     "decision_of",
     "effects_of",

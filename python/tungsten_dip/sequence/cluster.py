@@ -18,7 +18,7 @@ from typing import Any
 
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
-from tungsten_dip.progress import Progress, silent
+from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.sequence.following import Follower, Models
 from tungsten_dip.sequence.frames import Frame
@@ -45,11 +45,11 @@ _LOCAL_WORKERS = {
 def denoise_on_cluster(
     frames: Sequence[Frame],
     run: Run,
-    scheduler: str = "local",
-    workers: int = 1,
-    models: Models | None = None,
-    progress: Progress = silent,
-    tell: Callable[[Record], None] = lambda _: None,
+    scheduler: str,
+    workers: int,
+    models: Models,
+    progress: Progress,
+    tell: Callable[[Record], None],
 ) -> tuple[list[Record], Models]:
     """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes.
 
@@ -67,7 +67,7 @@ def denoise_on_cluster(
     if run.settings.threads is None:
         share = max(1, thread_count(None) // workers) if scheduler == "local" else 1
         run = replace(run, settings=replace(run.settings, threads=share))
-    shared = models or Models()
+    shared = models
     if to_do:
         with _client(scheduler, workers) as client:
             for done, found, remarks in _done(client, to_do, run, models):

@@ -120,9 +120,9 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
         triangles = mesh.triangles[part]
         node = {**_surroundings(t, primitive, bsdf), **emission}
         if emission and normals is not None:
-            faces = _triangles(t, {}, positions, triangles, mesh.uvs)
+            faces = _triangles({}, positions, triangles, mesh.uvs)
             node["emitter"] = {**emission["emitter"], "faces": faces}
-        shapes.append(_triangles(t, node, positions, triangles, mesh.uvs, normals))
+        shapes.append(_triangles(node, positions, triangles, mesh.uvs, normals))
     return shapes
 
 
@@ -136,7 +136,7 @@ def _quad(t: Translation, primitive: ts.Quad) -> Any:
     triangles = np.array([[0, 2, 1], [0, 3, 2]])
     node = _surroundings(t, primitive, primitive.bsdf)
     node |= emission_node(t, primitive, float(lengths[0] * lengths[1]))
-    return _triangles(t, node, positions, triangles, uv)
+    return _triangles(node, positions, triangles, uv)
 
 
 def _cube(t: Translation, primitive: ts.Cube) -> Any:
@@ -162,7 +162,7 @@ def _cube(t: Translation, primitive: ts.Cube) -> Any:
     area = 2.0 * float(scale[0] * scale[1] + scale[1] * scale[2] + scale[2] * scale[0])
     node = _surroundings(t, primitive, primitive.bsdf) | emission_node(t, primitive, area)
     points = centre + (np.concatenate(positions) * scale) @ rotation.T
-    return _triangles(t, node, points, indices, np.concatenate(uv))
+    return _triangles(node, points, indices, np.concatenate(uv))
 
 
 def _sphere(t: Translation, primitive: ts.Sphere) -> Node:
@@ -270,7 +270,6 @@ def _is_uniform(primitive: ts.Cylinder) -> bool:
 
 
 def _triangles(
-    t: Translation,
     node: Node,
     positions: _Array,
     triangles: npt.NDArray[Any],

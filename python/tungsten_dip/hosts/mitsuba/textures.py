@@ -102,9 +102,9 @@ def slopes_node(t: Translation, texture: Texture, uv: Matrix = UV) -> Node:
     return _bitmap_node(slopes, uv, clamp=False, nearest=False)
 
 
-def is_constant(texture: Texture, value: Vec3 | None = None) -> bool:
-    """Whether a texture is one colour everywhere, and that colour if one is given."""
-    return isinstance(texture, ConstantTexture) and (value is None or texture.value == value)
+def is_constant(texture: Texture) -> bool:
+    """Whether a texture is one colour everywhere."""
+    return isinstance(texture, ConstantTexture)
 
 
 def largest_value(t: Translation, texture: Texture) -> float:
