@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -270,8 +271,10 @@ def test_all_that_can_be_measured_here_is_shown_in_table_plot_and_page(folder, b
 
 
 def test_peers_that_are_missing_are_left_out_and_that_is_said(bench_set, fits, tmp_path, monkeypatch, caplog):
-    for module in ("fit", "fit.oidn"):
-        monkeypatch.setattr(f"tungsten_dip.{module}.find_spec", lambda name: None)
+    missing = ("torch", "pyoidn")
+    monkeypatch.setattr(
+        "tungsten_dip.extras.find_spec", lambda name: None if name in missing else find_spec(name)
+    )
     with caplog.at_level(logging.INFO):
         plan = replace(QUICK, kinds=("presets", "paper", "oidn", "nfor", "samples"), repeats=1)
         (found,) = run_pareto([bench_set], plan, tmp_path)
@@ -355,7 +358,7 @@ def test_the_command_prints_the_table_or_json(folder, fits, tmp_path, capfd):
 
 
 def test_without_matplotlib_nothing_is_measured(bench_set, fits, tmp_path, monkeypatch):
-    monkeypatch.setattr(plot, "find_spec", lambda name: None)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tungsten-dip\[bench\]'"):
         run_pareto([bench_set], QUICK, tmp_path)
     assert fits == []

@@ -638,7 +638,7 @@ def test_texts_that_are_no_duration(text):
 
 
 def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
-    monkeypatch.setattr("tungsten_dip.fit.find_spec", lambda name: None)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
     assert (
         tungsten.main(["--dip-denoise", "--dip-preset", "paper", "-d", str(tmp_path / "out"), str(scene)])
         == 2
@@ -844,7 +844,7 @@ def test_ctrl_c_that_is_ignored_stays_so():
 def test_what_the_fit_lacks_is_told_before_the_render(tmp_path, monkeypatch, capfd):
     scene = tmp_path / "scene.json"
     scene.write_text(json.dumps(SCENE))
-    monkeypatch.setattr("tungsten_dip.fit.oidn.find_spec", lambda name: None)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
     monkeypatch.setattr("onnxruntime.get_available_providers", list)
     lacks = {("--dip-pilot", "oidn"): "needs pyoidn", ("--dip-device", "cuda"): "expected an onnxruntime"}
     for option, told in lacks.items():

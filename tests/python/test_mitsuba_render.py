@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import threading
@@ -494,7 +493,7 @@ def test_a_scene_that_mitsuba_cannot_load() -> None:
 
 
 def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tungsten-dip\[mitsuba\]'"):
         render_translated(ball(), spp=1)
 

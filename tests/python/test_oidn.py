@@ -26,7 +26,7 @@ def _needs_pyoidn(request):
 
 @pytest.fixture
 def without_pyoidn(monkeypatch):
-    monkeypatch.setattr(oidn, "find_spec", lambda name: None)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
 
 
 @pytest.mark.parametrize("quality", ["fast", "balanced", "high"])

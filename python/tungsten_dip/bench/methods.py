@@ -15,8 +15,8 @@ from tungsten_dip.bench.nfor import nfor_image
 from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import require_torch
-from tungsten_dip.fit.oidn import Quality, oidn_image, require_oidn
+from tungsten_dip.extras import require
+from tungsten_dip.fit.oidn import Quality, oidn_image
 from tungsten_dip.fit.published.constants import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.progress import Progress
@@ -152,9 +152,11 @@ def settings_text(settings: FitSettings) -> str:
 
 
 def _can_run(kind: str) -> bool:
-    required = {"paper": require_torch, "oidn": require_oidn}
     try:
-        required.get(kind, lambda: None)()
+        if kind == "paper":
+            require("torch", "preset paper")
+        elif kind == "oidn":
+            require("pyoidn", "Open Image Denoise")
     except InputError as error:
         _LOG.warning("%s; measured without", error)
         return False

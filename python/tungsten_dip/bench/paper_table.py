@@ -16,12 +16,13 @@ import numpy as np
 from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.methods import Method, paper_method
 from tungsten_dip.bench.paper_curve import checkpoints_up_to
-from tungsten_dip.bench.plot import require_matplotlib, write_iterations_plot
+from tungsten_dip.bench.plot import write_iterations_plot
 from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import require
 from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.published.constants import ITERATIONS
 from tungsten_dip.fit.published.images import paper_images
@@ -123,7 +124,7 @@ def run_paper_table(
     Raises InputError if a row is not one of the 13.
     """
     if figure:
-        require_matplotlib()
+        require("matplotlib", "the plot")
     published = published_rows(scene)
     unknown = [number for number in rows or () if not 1 <= number <= len(published)]
     if unknown:

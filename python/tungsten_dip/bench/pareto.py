@@ -9,11 +9,12 @@ from pathlib import Path
 from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.methods import IN_TIME, OIDN, OURS, PAPER, SAMPLES, Plan, methods_for
 from tungsten_dip.bench.page import pareto_page
-from tungsten_dip.bench.plot import require_matplotlib, write_pareto_plot
+from tungsten_dip.bench.plot import write_pareto_plot
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet, cropped
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
 from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.extras import require
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.progress import Progress, silent
 
@@ -28,7 +29,7 @@ def run_pareto(
 
     Raises InputError if the folder holds something else, or a method cannot be run.
     """
-    require_matplotlib()
+    require("matplotlib", "the plot")
     methods = methods_for(sets, plan)
     runner = Runner(folder, plan.threads)
     tasks = runner.missing(

@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +17,6 @@ from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import Row, SetRows
 from tungsten_dip.buffers import FloatImage, replacing
-from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP, display_from_radiance
 
 if TYPE_CHECKING:
@@ -64,12 +62,6 @@ _VARIABLES = {
     _PAGE.line: "var(--line)",
     **{color: f"var(--series-{index + 1})" for index, color in enumerate(_PAGE.series)},
 }
-
-
-def require_matplotlib() -> None:
-    """Raise InputError if matplotlib is not installed: a plot comes after long work."""
-    if find_spec("matplotlib") is None:
-        raise InputError("plots need matplotlib; install it with: pip install 'tungsten-dip[bench]'")
 
 
 def write_pareto_plot(folder: Path, found: Sequence[SetRows]) -> None:

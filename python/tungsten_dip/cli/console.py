@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import EXTRA_BY_MODULE, requirement
 from tungsten_dip.remarks import logging_to
 
 tqdm.get_lock()  # made on first use otherwise, which Ctrl-C must not cut short
@@ -25,17 +26,6 @@ EXIT_INTERNAL, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 DEBUG_VARIABLE = "TUNGSTEN_DIP_DEBUG"
 """Set in the environment, it lets tracebacks through."""
-
-EXTRA_BY_MODULE = {
-    "torch": "fit",
-    "mitsuba": "mitsuba",
-    "drjit": "mitsuba",
-    "flip_evaluator": "compare",
-    "skimage": "compare",
-    "pyoidn": "oidn",
-    "matplotlib": "bench",
-}
-"""Which optional part of the package brings a module that is not installed."""
 
 _NO_MEMORY = (
     "t allocate memory",
@@ -89,12 +79,7 @@ def run(command: str, body: Callable[[], None]) -> int:
         if debug:
             raise
         if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
-            extra = EXTRA_BY_MODULE[error.name]
-            return _fail(
-                command,
-                f"needs {error.name}; install it with pip install 'tungsten-dip[{extra}]'",
-                EXIT_INPUT,
-            )
+            return _fail(command, requirement(error.name, "this"), EXIT_INPUT)
         if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
             reason = str(error)[:200] or "none left"
             line = f"not enough memory ({reason}); free some, or use a smaller image"

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
-from tungsten_dip.fit.oidn import require_oidn
 from tungsten_dip.fit.preparation import finished, prepared
 from tungsten_dip.fit.settings import FitResult, FitSettings
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
 
-__all__ = ["FitResult", "FitSettings", "check_ready", "denoise", "require_torch"]
+__all__ = ["FitResult", "FitSettings", "check_ready", "denoise"]
 
 
 def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
@@ -24,7 +23,7 @@ def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
     Loads neither Open Image Denoise nor, but for a GPU, torch: a render may come before the fit.
     """
     if settings.preset == "paper":
-        require_torch()
+        require("torch", "preset paper")
         if settings.device == "cuda":
             with held_interrupts():
                 from tungsten_dip.fit.published.device import check_torch_device
@@ -36,15 +35,9 @@ def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
 
         check_device(settings.device)
         if settings.pilot == "oidn":
-            require_oidn()
+            require("pyoidn", "Open Image Denoise")
     if warm_start is not None:
         check_settings(warm_start, settings)
-
-
-def require_torch() -> None:
-    """Raise InputError if torch is not installed, without importing it."""
-    if find_spec("torch") is None:
-        raise InputError("preset paper needs torch; install it with: pip install 'tungsten-dip[fit]'")
 
 
 def denoise(

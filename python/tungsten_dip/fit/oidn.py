@@ -6,7 +6,6 @@ https://www.openimagedenoise.org, through the package ``pyoidn``, on the CPU.
 from __future__ import annotations
 
 import logging
-from importlib.util import find_spec
 from typing import Literal
 
 import numpy as np
@@ -15,16 +14,11 @@ from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import require
 
 _LOG = logging.getLogger(__name__)
 
 Quality = Literal["fast", "balanced", "high"]
-
-
-def require_oidn() -> None:
-    """Raise InputError if pyoidn is not installed, without importing it."""
-    if find_spec("pyoidn") is None:
-        raise InputError("Open Image Denoise needs pyoidn; install it with: pip install 'tungsten-dip[oidn]'")
 
 
 def oidn_image(
@@ -47,7 +41,7 @@ def oidn_image(
     """
     if color.size == 0:
         raise InputError(f"expected an image of at least one pixel, got one of shape {color.shape}")
-    require_oidn()
+    require("pyoidn", "Open Image Denoise")
     import pyoidn
 
     if normal is not None and albedo is None:

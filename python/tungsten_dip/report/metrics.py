@@ -13,6 +13,7 @@ import numpy.typing as npt
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import requirement
 from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _LOG = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
 
     for package, metric in _METRIC_BY_PACKAGE.items():
         if find_spec(package) is None:
-            _LOG.info("no %s: it needs %s; pip install 'tungsten-dip[compare]'", metric, package)
+            _LOG.info("%s", requirement(package, metric))
 
     finite = np.isfinite(image)
     x = np.where(finite, image, 0).astype(np.float32)

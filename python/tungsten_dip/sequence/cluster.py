@@ -18,6 +18,7 @@ from typing import Any
 
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import require
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.sequence.following import Follower, Models
@@ -127,13 +128,10 @@ def _denoise_frames(
 
 @contextmanager
 def _client(scheduler: str, workers: int) -> Iterator[Any]:
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise InputError(
-            "several workers need dask; install it with: pip install 'tungsten-dip[cluster]'"
-        ) from error
+    require("distributed", "a run on several workers")
+    import dask
+    from distributed import Client, LocalCluster
+
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler == "local":
         with dask.config.set(_LOCAL_WORKERS), _safe_path(), ExitStack() as stack:

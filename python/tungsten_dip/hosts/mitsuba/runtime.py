@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import importlib.util
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.extras import require
 from tungsten_dip.interrupts import held_interrupts
 
 _log = logging.getLogger(__name__)
@@ -34,8 +34,7 @@ def mitsuba_variant() -> Iterator[ModuleType]:
 
     Raises InputError if Mitsuba, our plugins or the working directory are missing.
     """
-    if importlib.util.find_spec("mitsuba") is None:
-        raise InputError("rendering needs the package mitsuba: pip install 'tungsten-dip[mitsuba]'")
+    require("mitsuba", "rendering")
     installed = importlib.metadata.version("mitsuba")
     if installed != VERSION:
         raise InputError(

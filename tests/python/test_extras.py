@@ -1,0 +1,24 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tungsten_dip.errors import InputError
+from tungsten_dip.extras import EXTRA_BY_MODULE, require
+
+
+def test_every_extra_is_one_of_the_package() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert set(EXTRA_BY_MODULE.values()) <= set(project["optional-dependencies"])
+
+
+def test_a_missing_module_is_named_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
+    message = r"preset paper needs torch; install it with: pip install 'tungsten-dip\[fit\]'"
+    with pytest.raises(InputError, match=message):
+        require("torch", "preset paper")
+
+
+def test_an_installed_module_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: object())
+    require("torch", "preset paper")
