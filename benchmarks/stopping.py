@@ -8,6 +8,7 @@ prints a Markdown table. The image is looked at every 20 steps, before it yields
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -15,8 +16,6 @@ import numpy as np
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, fusion
-from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import Start, start_of_training
@@ -43,8 +42,8 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
                 image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])
                 found.append(compare(image.reshape(evidence.mean.shape), bench_set.reference).psnr)
 
-    def start(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
-        starts.append(start_of_training(evidence, seed, model, members))
+    def start(*arguments: Any) -> Start:
+        starts.append(start_of_training(*arguments))
         return starts[-1]
 
     with (

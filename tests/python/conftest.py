@@ -16,6 +16,7 @@ from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import FitResult, denoise
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx import save_model
+from tungsten_dip.report.metrics import relative_squared_error
 
 SAMPLE_SHAPE = 0.5
 """Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""
@@ -126,6 +127,11 @@ def saved(model: Model, tmp_path: Path) -> Path:
     """The file of that network."""
     save_model(tmp_path / "m.onnx", model)
     return tmp_path / "m.onnx"
+
+
+def relmse(image: FloatImage, reference: FloatImage) -> float:
+    """Return mean((x - r)^2 / (r^2 + 0.01)), as `report.metrics.compare` does."""
+    return float(relative_squared_error(image, reference).mean())
 
 
 def synthetic_render(height: int = 40, width: int = 56, spp: int = 16, seed: int = 0) -> SyntheticRender:

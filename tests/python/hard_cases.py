@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import strategies
 
-from conftest import synthetic_render
+from conftest import relmse, synthetic_render
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, sanitize
 from tungsten_dip.fit import FitResult
 
@@ -111,7 +111,7 @@ def rel_mse(image: FloatImage, reference: FloatImage, where: npt.NDArray[np.bool
     """Return the relative squared error of some pixels, whatever the exposure."""
     image, truth = (array[where].astype(np.float64) for array in (image, reference))
     typical = float(truth.mean()) or 1.0
-    return float(np.mean((image - truth) ** 2 / (truth**2 + 0.01 * typical**2)))
+    return relmse(image / typical, truth / typical)
 
 
 def out_of_reach(bad: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from conftest import MakeRender, SyntheticRender
+from conftest import MakeRender, SyntheticRender, relmse
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
@@ -31,10 +31,6 @@ from tungsten_dip.fit.training import Training, _batches, train
 
 def _settings(**changes: Any) -> FitSettings:
     return FitSettings(**{"preset": "draft", "iterations": 30, "threads": 1, "device": "cpu", **changes})
-
-
-def _rel_mse(image: FloatImage, reference: FloatImage) -> float:
-    return float(np.mean((image - reference) ** 2 / (reference**2 + 0.01)))
 
 
 def _check(result: FitResult, buffers: RenderBuffers) -> None:
@@ -68,8 +64,8 @@ def test_error_falls_and_is_estimated(preset: str, spp: int, factor: float, make
     render = make_render(spp=spp)
     result = denoise(render.buffers, _settings(preset=preset, iterations=60))
     _check(result, render.buffers)
-    error = _rel_mse(result.color, render.reference)
-    assert error < _rel_mse(render.buffers.color.mean, render.reference) / factor
+    error = relmse(result.color, render.reference)
+    assert error < relmse(render.buffers.color.mean, render.reference) / factor
     assert result.estimated_relmse is not None
     # Some thousand pixels do not tell it well.
     assert error / 2 < result.estimated_relmse < 6 * error
@@ -151,12 +147,12 @@ def test_color_alone(render: SyntheticRender) -> None:
     result = denoise(buffers, _settings())
     _check(result, buffers)
     assert any("no albedo, normal, depth" in note for note in result.notes)
-    noisy = _rel_mse(buffers.color.mean, render.reference)
-    assert _rel_mse(result.color, render.reference) < noisy / 1.4
+    noisy = relmse(buffers.color.mean, render.reference)
+    assert relmse(result.color, render.reference) < noisy / 1.4
     without_halves = RenderBuffers(Buffer(buffers.color.mean))
     result = denoise(without_halves, _settings())
     _check(result, without_halves)
-    assert _rel_mse(result.color, render.reference) < 1.2 * noisy  # every edge passes for noise
+    assert relmse(result.color, render.reference) < 1.2 * noisy  # every edge passes for noise
 
 
 @pytest.mark.parametrize("missing", ["albedo", "normal", "depth"])
@@ -175,8 +171,8 @@ def test_without_halves_the_noise_is_split(render: SyntheticRender) -> None:
     _check(result, buffers)
     assert result.model is not None
     assert any("no half buffers: its noise" in note for note in result.notes)
-    error = _rel_mse(result.color, render.reference)
-    assert error < _rel_mse(color.mean, render.reference) / 8
+    error = relmse(result.color, render.reference)
+    assert error < relmse(color.mean, render.reference) / 8
     assert result.estimated_relmse is not None
     assert error / 4 < result.estimated_relmse < 4 * error
     assert (denoise(buffers, _settings()).color == result.color).all()
@@ -200,7 +196,7 @@ def test_copied_halves_are_replaced(render: SyntheticRender) -> None:
     result = denoise(buffers, _settings())
     _check(result, buffers)
     assert any("not independent" in note for note in result.notes)
-    assert _rel_mse(result.color, render.reference) < _rel_mse(mean, render.reference) / 8
+    assert relmse(result.color, render.reference) < relmse(mean, render.reference) / 8
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e12, 1e30])
@@ -228,8 +224,8 @@ def test_a_wild_albedo_is_not_smeared(value: float, render: SyntheticRender) -> 
         planes[name][30, 40] = value
     result = denoise(render.buffers.with_quantities(albedo=Buffer(**planes)), _settings())
     _check(result, render.buffers)
-    noisy = _rel_mse(render.buffers.color.mean, render.reference)
-    assert _rel_mse(result.color, render.reference) < noisy / 4
+    noisy = relmse(render.buffers.color.mean, render.reference)
+    assert relmse(result.color, render.reference) < noisy / 4
 
 
 def test_a_firefly_leaves_no_blot(render: SyntheticRender) -> None:
@@ -242,7 +238,7 @@ def test_a_firefly_leaves_no_blot(render: SyntheticRender) -> None:
     result = denoise(buffers, _settings())
     _check(result, buffers)
     assert any("1 firefly limited" in note for note in result.notes)
-    assert _rel_mse(result.color, render.reference) < _rel_mse(color.mean, render.reference) / 4
+    assert relmse(result.color, render.reference) < relmse(color.mean, render.reference) / 4
 
 
 def test_black_stays_black(render: SyntheticRender) -> None:
@@ -276,7 +272,7 @@ def test_a_good_candidate_is_chosen(render: SyntheticRender) -> None:
     truth = render.reference
     together = denoise(render.buffers, _settings(), candidates=[(truth, truth)])
     _check(together, render.buffers)
-    assert _rel_mse(together.color, truth) < _rel_mse(alone.color, truth) / 2
+    assert relmse(together.color, truth) < relmse(alone.color, truth) / 2
 
 
 def test_a_bad_candidate_does_little_harm(render: SyntheticRender) -> None:
@@ -284,7 +280,7 @@ def test_a_bad_candidate_does_little_harm(render: SyntheticRender) -> None:
     wrong = np.full_like(render.reference, -1.0)
     together = denoise(render.buffers, _settings(iterations=80), candidates=[(wrong, 10 * render.reference)])
     _check(together, render.buffers)
-    assert _rel_mse(together.color, render.reference) < 1.3 * _rel_mse(alone.color, render.reference)
+    assert relmse(together.color, render.reference) < 1.3 * relmse(alone.color, render.reference)
 
 
 def test_candidates_without_halves_are_noted(render: SyntheticRender) -> None:
@@ -513,7 +509,7 @@ def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None
     alone = images(render.buffers.with_quantities(**dict.fromkeys(features)), by_color)
     np.testing.assert_array_equal(images(noisy, by_color), images(render.buffers, by_color))
     np.testing.assert_array_equal(images(noisy, by_color), alone)
-    errors = [_rel_mse(images(noisy, pilot)[0], render.reference) for pilot in (by_color, by_features)]
+    errors = [relmse(images(noisy, pilot)[0], render.reference) for pilot in (by_color, by_features)]
     assert errors[0] < 0.8 * errors[1]
 
 
@@ -752,5 +748,5 @@ def test_small_images_are_no_worse_for_more_pilots(make_render: MakeRender) -> N
     for preset in ("draft", "balanced"):
         renders = [make_render(64, 36, seed=seed) for seed in range(3)]
         results = [denoise(r.buffers, FitSettings(preset, threads=1)).color for r in renders]
-        errors.append(np.mean([_rel_mse(c, r.reference) for c, r in zip(results, renders, strict=True)]))
+        errors.append(np.mean([relmse(c, r.reference) for c, r in zip(results, renders, strict=True)]))
     assert errors[1] < 1.1 * errors[0]

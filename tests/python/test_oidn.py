@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 
+from conftest import relmse
 from tungsten_dip.buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, oidn
@@ -92,8 +93,7 @@ def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
         assert result.model is not None
         assert result.model.layout is not None
         assert result.model.layout.candidates == (pilot == "oidn")
-        squared = (result.color - render.reference) ** 2
-        return float((squared / (render.reference**2 + 0.01)).mean())
+        return relmse(result.color, render.reference)
 
     assert error("oidn") < 1.1 * error("none")
 

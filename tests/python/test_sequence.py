@@ -7,6 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
+from conftest import relmse
 from moving_camera import HEIGHT, WIDTH, true_frame
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
@@ -256,10 +257,6 @@ def test_the_halves_tell_the_flicker(bias):
 
 
 # --- One frame after another ---
-
-
-def relmse(image, reference):
-    return float(np.mean((image - reference) ** 2 / (reference**2 + 0.01)))
 
 
 def test_frames_follow_and_gain_from_it(tmp_path):

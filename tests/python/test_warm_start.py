@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import SyntheticRender
+from conftest import SyntheticRender, relmse
 from fitted_models import DRAFT, paper_model
 from tungsten_dip.buffers import Buffer, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
@@ -45,17 +45,14 @@ def test_a_warm_start_starts_from_the_weights_and_constants(
 def test_a_warm_start_ends_when_the_error_falls_no_further(
     frame: SyntheticRender, next_frame: SyntheticRender
 ) -> None:
-    def relmse(result: FitResult) -> float:
-        truth = next_frame.reference
-        return float(np.mean((result.color - truth) ** 2 / (truth**2 + 0.01)))
-
     long = replace(DRAFT, iterations=150)
     trained = denoise(frame.buffers, long).model
     cold = denoise(next_frame.buffers, long)
     warm = denoise(next_frame.buffers, replace(DRAFT, iterations=150), warm_start=trained)
     assert warm.iterations < 100
     assert any("falls no further" in note for note in warm.notes)
-    assert relmse(warm) < 1.25 * relmse(cold)
+    error, cold_error = (relmse(result.color, next_frame.reference) for result in (warm, cold))
+    assert error < 1.25 * cold_error
     # Without settings, those of the model hold.
     assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
 

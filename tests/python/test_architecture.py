@@ -1,0 +1,55 @@
+"""Holds the package to the table of layers in docs/architecture.md."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "python" / "tungsten_dip"
+
+FACES = ("__init__.py", "__main__.py")
+"""Of the package itself: they offer what other layers define."""
+
+
+def layers() -> list[str]:
+    """Return the layers of the table, from the top down."""
+    table = (ROOT / "docs" / "architecture.md").read_text().split("\n\n")[2]
+    return re.findall(r"^\| (\w+) \|", table, flags=re.MULTILINE)[1:]
+
+
+def layer_of(module: str) -> str:
+    """Return the layer of ``tungsten_dip.a.b``; what lies in no folder is of the root."""
+    name = module.split(".")[1]
+    return name if (PACKAGE / name).is_dir() else "root"
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_the_table_lists_every_folder() -> None:
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert {*folders, "root"} == set(layers())
+
+
+def test_imports_point_downwards_only() -> None:
+    order = layers()
+    checked, upwards = 0, []
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).parts
+        if parts[0] in FACES:
+            continue
+        own = parts[0] if len(parts) > 1 else "root"
+        for module in imported_modules(path):
+            if not module.startswith("tungsten_dip."):
+                continue
+            checked += 1
+            if order.index(layer_of(module)) < order.index(own):
+                upwards.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert upwards == []
+    assert checked > 100
