@@ -1,4 +1,4 @@
-"""What each part of the preset balanced gives: PSNR, relMSE, FLIP and seconds without it.
+"""What each part of the preset balanced contributes: PSNR, relMSE, FLIP and seconds without it.
 
     python benchmarks/ablation.py renders/cornell-box/n4=renders/cornell-box/reference.exr ...
 
@@ -43,10 +43,10 @@ VARIANTS: dict[str, Change] = {
     ),
     "one pilot and the noisy image": _with_one_pilot,
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
-    "guided pilots alone": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
+    "only guided pilots": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
     "no regression on the position": _without(lambda pilot: pilot.with_position),
     "no mean along edges as a pilot": _without(lambda pilot: pilot.along_edges),
-    "no pilot that sees the colour alone": _without(lambda pilot: pilot.by_color),
+    "no pilot that sees only the colour": _without(lambda pilot: pilot.by_color),
     "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 1, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         pilots, "_smooth_emission", lambda emission, filtered, *_: filtered

@@ -1,4 +1,4 @@
-"""How true the estimated error is: the estimate over the error, and how the maps of both agree.
+"""How accurate the estimated error is: the estimate over the error, and how the maps of both agree.
 
     python benchmarks/calibration.py --spp-ratio 0.004 cornell-box/n4=cornell-box/reference.exr ...
 
@@ -40,7 +40,7 @@ def main() -> None:
 def _row(bench_set: BenchSet, settings: FitSettings, ratio: float) -> str:
     result = denoise(bench_set.buffers, settings)
     if result.error is None or result.estimated_relmse is None:
-        raise InputError(f"{bench_set.name}: expected independent halves, which tell the error")
+        raise InputError(f"{bench_set.name}: expected independent halves, from which the error is estimated")
     reference = bench_set.reference
     error = relative_squared_error(result.color, reference)
     # The noisy image's error is its own noise and the reference's, which is less by the ratio.

@@ -81,7 +81,7 @@ def fog(scene: Json) -> None:
 
 
 def curves(**bsdf: Any) -> Edit:
-    """Strands stand on the floor."""
+    """Strands on the floor."""
 
     def edit(scene: Json) -> None:
         strands = {"type": "curves", "file": STRANDS, "curve_thickness": 0.004, "bsdf": bsdf}
@@ -128,7 +128,7 @@ PAIRS: dict[str, tuple[Edit, Edit]] = {
 
 
 def write_strands(path: Path, count: int = 2000, points: int = 6) -> None:
-    """Write strands that stand on the floor, bent at random, in Cem Yuksel's format."""
+    """Write strands on the floor, bent at random, in Cem Yuksel's format."""
     rng = np.random.default_rng(0)
     root = np.stack([rng.uniform(-1.7, 1.7, count), np.zeros(count), rng.uniform(-1.5, 1.5, count)], axis=-1)
     height = np.linspace(0.0, 1.0, points)[None, :, None]

@@ -2,7 +2,7 @@
 
     python benchmarks/stopping.py renders/cornell-box/n4=renders/cornell-box/reference.exr ...
 
-prints a Markdown table. The image is looked at every 20 steps, before it yields to the noisy pixels.
+prints a Markdown table. The image is compared every 20 steps, before it is blended with the noisy pixels.
 """
 
 import argparse

@@ -1,5 +1,5 @@
-"""The one exception for what a user can mend: bad files, bad scenes, bad settings."""
+"""The one exception for what a user can fix: bad files, bad scenes, bad settings."""
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The message is one line: what was expected, what came, what to do."""
+    """Input that cannot be used. The message is one line: what was expected, what was found, what to do."""

@@ -9,17 +9,17 @@ from contextlib import AbstractContextManager, contextmanager
 
 
 def held_interrupts() -> AbstractContextManager[None]:
-    """Raise a KeyboardInterrupt that comes within the block at its end: for imports of libraries.
+    """Defer Ctrl-C within the block to its end: for imports of libraries.
 
-    Those that are interrupted while they load leave half of themselves behind, or end the process.
+    An import that is interrupted leaves a module half initialised, or ends the process.
     """
     return _noted_interrupts(at_once=False)
 
 
 def heeded_interrupts() -> AbstractContextManager[None]:
-    """Raise a KeyboardInterrupt within the block where it comes and, if it is caught there, again at its end.
+    """Raise KeyboardInterrupt on Ctrl-C within the block and, if it is caught there, again at its end.
 
-    A fit ends early on it with what it has.
+    A fit catches it, and ends early with the result so far.
     """
     return _noted_interrupts(at_once=True)
 
@@ -27,7 +27,7 @@ def heeded_interrupts() -> AbstractContextManager[None]:
 @contextmanager
 def _noted_interrupts(at_once: bool) -> Iterator[None]:
     in_main_thread = threading.current_thread() is threading.main_thread()
-    # A job in the background of a shell ignores Ctrl-C; None is a handler that Python does not know.
+    # A background job of a shell ignores Ctrl-C; None is a handler that was not installed from Python.
     if not in_main_thread or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
         yield
         return

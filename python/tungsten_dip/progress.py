@@ -1,4 +1,4 @@
-"""How long work tells its caller where it stands, without knowing who is listening."""
+"""The callback by which long work reports its progress."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ Progress = Callable[[float, str], None]
 
 
 def silent(fraction: float, message: str) -> None:
-    """Report to nobody."""
+    """Discard the report."""
 
 
 def part_of(progress: Progress, start: float, end: float, name: str) -> Progress:

@@ -119,7 +119,7 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
 
     assert _frozen_bytes(buffers) == before
     color_line, albedo_line = (next(line for line in lines if name in line) for name in ("color", "albedo"))
-    assert color_line == "mended color 3 NaN, 1 negative"
+    assert color_line == "repaired color 3 NaN, 1 negative"
     assert f"albedo variance {2 * buffers.width * 3} infinite" in albedo_line
     np.testing.assert_array_equal(mended.color.mean[2, 3], [5, 5, 5])
     assert mended.color.mean[5, 5, 0] == 0
@@ -152,7 +152,7 @@ def test_without_halves_the_neighbours_tell() -> None:
     variance = np.full((3, 3, 3), 0.5, np.float32)
     mean[1, 1], variance[1, 1], variance[0, 0] = np.inf, np.nan, 0.75
     mended, lines = sanitize(RenderBuffers(color=Buffer(mean, variance=variance)))
-    assert lines == ("mended color 3 infinite; color variance 3 NaN",)
+    assert lines == ("repaired color 3 infinite; color variance 3 NaN",)
     np.testing.assert_array_equal(mended.color.mean, 2)
     assert mended.color.variance is not None
     np.testing.assert_array_equal(mended.color.variance[1, 1], 0.75)
@@ -164,7 +164,7 @@ def test_every_size_passes_through_everything(shape: tuple[int, int], make_rende
     normal = Buffer(color.mean - 5, color.half_a, color.half_b, color.variance)
     nowhere = Buffer(np.full((*shape, 1), np.nan, np.float32))
     buffers, lines = sanitize(RenderBuffers(color=color, normal=normal, depth=nowhere))
-    assert lines == ((f"mended depth {shape[0] * shape[1]} NaN",) if shape[0] * shape[1] else ())
+    assert lines == ((f"repaired depth {shape[0] * shape[1]} NaN",) if shape[0] * shape[1] else ())
     assert buffers.depth is not None
     np.testing.assert_array_equal(buffers.depth.mean, np.zeros((*shape, 1)))
     filtered = prefilter_features(buffers)

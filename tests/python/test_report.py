@@ -54,12 +54,12 @@ def result(render):
 
 
 def test_a_note_that_was_logged_is_shown_once(render, result):
-    html = report_page("room", render.buffers, result, "filmic", ["mended 3 NaN", *result.notes])
+    html = report_page("room", render.buffers, result, "filmic", ["repaired 3 NaN", *result.notes])
     assert html.count("no visibility: fitted without") == 1
 
 
 def test_the_page_shows_everything_and_needs_no_network(render, result):
-    html = report_page("A <b>room</b>", render.buffers, result, "filmic", ["mended 3 NaN"])
+    html = report_page("A <b>room</b>", render.buffers, result, "filmic", ["repaired 3 NaN"])
     page = Page(html)
     images = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
     assert set(images) == {"noisy", "denoised", "albedo", "normal", "depth", "estimated error"}
@@ -70,7 +70,7 @@ def test_the_page_shows_everything_and_needs_no_network(render, result):
         "A <b>room</b>",
         "12.3 s",
         "0.04",
-        "mended 3 NaN",
+        "repaired 3 NaN",
         "fitted without <it>",
         "56 x 40",
         "16 samples",
@@ -113,7 +113,7 @@ def test_what_is_not_known_is_said_and_not_drawn(render):
     assert images_of(page) == ["noisy", "denoised"]
     assert "svg" not in tags
     assert "the error was not estimated" in page.text
-    assert "the colour alone" in page.text
+    assert "the colour only" in page.text
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 7)])

@@ -215,7 +215,7 @@ def test_every_buffer_is_decided_on_with_a_reason(load, scene):
 def test_inspect_says_what_becomes_of_another_integrator(load):
     assert "path_tracer" not in inspect_text(load({}))
     text = inspect_text(load({"integrator": {"type": "bidirectional_path_tracer"}}))
-    assert "bidirectional_path_tracer: Tungsten writes colour alone" in text
+    assert "bidirectional_path_tracer: Tungsten writes only colour" in text
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_inspect_says_it_all():
     text = inspect_text(scene)
     assert "384 x 216 pixels" in text
     assert "participating media  fog (homogeneous)" in text
-    assert re.search("albedo +learned from +tells surfaces", text)
+    assert re.search("albedo +learned from +distinguishes surfaces", text)
     assert re.search("visibility +left out +one random", text)
     facts = json.loads(json.dumps(inspect_facts(scene)))
     assert facts["effects"]["participating_media"] == ["fog (homogeneous)"]

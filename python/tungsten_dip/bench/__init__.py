@@ -1,1 +1,1 @@
-"""What accuracy costs in time: our fits, their peers and the published method, measured."""
+"""Measures accuracy against time: our fits, other denoisers and the published method."""

@@ -1,4 +1,4 @@
-"""Seconds per iteration of the published method: ours, plain PyTorch, and the convolutions alone."""
+"""Seconds per iteration of the published method: ours, plain PyTorch, and only the convolutions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WARM_UP = 3
 class IterationTimes:
     """Median seconds of one iteration, in turns on one machine.
 
-    ``convolutions_s`` is what the plain network's convolutions take alone, forwards and backwards, each in
+    ``convolutions_s`` is the time of only the plain network's convolutions, forwards and backwards, each in
     the faster of two memory layouts. ``flops`` are theirs, of one iteration, a multiplication and an addition
     being two. ``peak_flops_per_s`` is what the best of them reaches.
     """
@@ -112,7 +112,7 @@ def times_text(times: IterationTimes, width: int, height: int, threads: int | No
     rows = (
         ("ours", times.ours_s),
         ("plain PyTorch", times.plain_s),
-        ("its convolutions alone", times.convolutions_s),
+        ("only its convolutions", times.convolutions_s),
     )
     lines = [f"| {name} | {seconds * 1e3:.1f} | {times.ours_s / seconds:.2f} |" for name, seconds in rows]
     return "\n".join(
@@ -127,7 +127,7 @@ def times_text(times: IterationTimes, width: int, height: int, threads: int | No
             f"Ours is {times.speedup:.2f} times as fast as plain PyTorch and does the convolutions' "
             f"{times.flops / 1e9:.2f} GFLOP at {flops_per_s / 1e9:.1f} GFLOP/s, "
             f"{flops_per_s / times.peak_flops_per_s:.0%} of the {times.peak_flops_per_s / 1e9:.1f} GFLOP/s "
-            "that the fastest of these shapes reaches alone.",
+            "that the fastest of these shapes reaches by itself.",
             "",
             "Measured with: " + "; ".join(f"{name} {value}" for name, value in machine_facts(threads)) + ".",
         ]
@@ -162,7 +162,7 @@ def _convolutions(network: nn.Module, image: Tensor) -> list[_Convolution]:
         weight = layer.weight.detach()
         first = shape[1] == image.shape[1] and shape[2] == image.shape[2]
         output_pixels = (shape[2] // layer.stride[0]) * (shape[3] // layer.stride[1])
-        # Forwards, the gradient of the weights and, but for what the image itself enters, that of the input.
+        # Forwards, the gradient of the weights and, except where the image is the input, that of the input.
         passes = 2 if first else 3
         runs = tuple(
             _run(padded.to(memory_format=layout), weight.to(memory_format=layout), layer.stride[0], not first)

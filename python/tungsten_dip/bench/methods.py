@@ -41,7 +41,7 @@ NOISY = "noisy"
 
 @dataclass(frozen=True)
 class Outcome:
-    """An image, and the seconds and iterations that it took where they are known."""
+    """An image, and the seconds and iterations of its computation where they are known."""
 
     label: str
     image: np.ndarray
@@ -53,11 +53,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to a denoised image; a run of it gives one outcome for each of its labels.
+    """One way to compute a denoised image; a run of it gives one outcome for each of its labels.
 
-    ``marks`` are the labels in the shortest words, for plots that name the series already. ``settings`` tells
-    two runs of one label apart. ``run`` takes the number of the repeat. A method that is not ``timed`` is run
-    once. ``pictured`` are the labels that a page shows the images of.
+    ``marks`` are the labels in the shortest words, for plots that show the series by colour. ``settings``
+    distinguishes two runs of one label. ``run`` takes the number of the repeat. A method that is not
+    ``timed`` is run once. ``pictured`` are the labels that a page shows the images of.
     """
 
     series: str
@@ -73,8 +73,8 @@ class Method:
 class Plan:
     """What to measure.
 
-    ``presets`` and ``budgets_s`` are ours; a budget is one for ``final``. ``nfor_s`` is what the saved NFOR
-    image took, ``denoiser`` Tungsten's command to measure it with. ``scenes`` are those of the sets in their
+    ``presets`` and ``budgets_s`` are ours; a budget is one for ``final``. ``nfor_s`` is the time of the saved
+    NFOR image, ``denoiser`` Tungsten's command to measure it with. ``scenes`` are those of the sets in their
     order, if any; they are rendered with ``sample_factors`` times the samples.
     """
 
@@ -240,8 +240,8 @@ def _nfor(bench_set: BenchSet, plan: Plan) -> Iterator[Method]:
         yield Method(NFOR, (label,), ("",), "measured", run, pictured=(label,))
     elif bench_set.nfor is not None:
         saved = Outcome(label, bench_set.nfor, plan.nfor_s)
-        told = f"saved, {plan.nfor_s:g} s" if plan.nfor_s else "saved"
-        unmeasured = Method(NFOR, (label,), ("",), told, lambda repeat, progress: [saved], timed=False)
+        settings = f"saved, {plan.nfor_s:g} s" if plan.nfor_s else "saved"
+        unmeasured = Method(NFOR, (label,), ("",), settings, lambda repeat, progress: [saved], timed=False)
         yield replace(unmeasured, pictured=(label,))
     else:
         _LOG.info(
@@ -272,7 +272,7 @@ def _samples(bench_set: BenchSet, plan: Plan, scene_path: Path) -> Iterator[Meth
             rendered = render(
                 scene, spp=factor * spp, seed=1000 + repeat, threads=plan.threads, progress=progress
             )
-            # A denoiser comes after the noisy render, so what counts here is the time on top of that.
+            # A denoiser needs the noisy render as well, so only the additional time counts here.
             seconds = (time.perf_counter() - start) * (1 - 1 / factor)
             return [Outcome(label, rendered.color.mean, seconds)]
 

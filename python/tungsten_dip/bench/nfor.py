@@ -17,7 +17,7 @@ from tungsten_dip.errors import InputError
 
 
 def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
-    """Return what Tungsten's command ``denoiser`` makes of the buffers: linear radiance, as it comes.
+    """Return the image that Tungsten's command ``denoiser`` computes from the buffers, linear radiance.
 
     Features of which a half or the variance is missing are left out, since the command cannot do without.
 
@@ -46,8 +46,8 @@ def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
                 f"{denoiser}: cannot be run ({error.strerror}); name Tungsten's denoiser"
             ) from error
         if done.returncode != 0 or not output.exists():
-            told = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
-            raise InputError(f"{denoiser}: failed with status {done.returncode} ({told}); leave it out")
+            message = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
+            raise InputError(f"{denoiser}: failed with status {done.returncode} ({message}); leave it out")
         return read_image(output)
 
 

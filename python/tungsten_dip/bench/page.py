@@ -21,11 +21,11 @@ DETAILS = 2
 DETAIL_FRACTION = 1 / 6
 """Side of a detail over the shorter side of the picture."""
 MAP_WIDTH_PX = 320
-"""Error maps are averaged down to about this width: they show where, not how much to the pixel."""
+"""Error maps are averaged down to about this width: they show where the error is, not its value per pixel."""
 
 
 def pareto_page(found: Sequence[SetRows], machine: Sequence[tuple[str, str]], repeats: int) -> str:
-    """Return the page, which holds everything it shows."""
+    """Return the page, which is self-contained."""
     names = ", ".join(each.bench_set.name for each in found)
     body = [part for each in found for part in _set_parts(each)]
     body += ["<h2>Measured with</h2>", html.facts(machine)]
@@ -38,8 +38,8 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     plots = (f"<figure><figcaption>{title}</figcaption>{svg}</figure>" for title, svg in pareto_svgs(each))
     yield f'{legend_html(each.rows)}<div class="grid plots">{"".join(plots)}</div>'
     yield (
-        "<p>What is worse than the noisy image is not in the plots. Set off: no faster method has a lower "
-        "relMSE.</p>"
+        "<p>The plots leave out what is worse than the noisy image. Highlighted: no faster method has a "
+        "lower relMSE.</p>"
     )
     yield html.table(COLUMNS, [cells(row) for row in each.rows], 1, each.front())
 
@@ -70,7 +70,7 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     maps = {label: _error_map(image, each.bench_set.reference) for label, image in images.items()}
     judged = [error for label, error in maps.items() if label != NOISY] or list(maps.values())
     if judged:
-        # The median, so that one method gone astray does not turn all others black.
+        # The median, so that one outlier does not turn the maps of all others black.
         most = float(np.sqrt(np.median([np.percentile(error, 99) for error in judged]))) or 1.0
         yield html.gallery(
             Picture(f"error of {label}", error_in_false_color(error, most)[0])
@@ -91,7 +91,7 @@ def _detail_side(picture: FloatImage) -> int:
 def _details(pictures: Sequence[FloatImage]) -> list[tuple[int, int]]:
     """Return the upper left corners (row, column) of squares in which the pictures differ most."""
     grey = np.stack(pictures).mean(axis=3)
-    # Medians, so that one method gone astray does not choose the details.
+    # Medians, so that one outlier does not choose the details.
     spread = np.median(np.abs(grey - np.median(grey, axis=0)), axis=0)
     side = _detail_side(pictures[0])
     sums = np.pad(spread.cumsum(0).cumsum(1), ((1, 0), (1, 0)))

@@ -1,4 +1,4 @@
-"""The published method as it goes: one fit, looked at after several iterations."""
+"""The published method over its iterations: one fit, sampled after several of them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tungsten_dip.progress import Progress
 
 @dataclass(frozen=True)
 class PaperPoint:
-    """Where the fit stood after an iteration.
+    """The state of the fit after an iteration.
 
-    ``seconds`` are those of the fit alone, without this looking. ``loss`` and ``psnr_noisy`` (dB, of the
+    ``seconds`` are those of the fit, without the time of sampling it. ``loss`` and ``psnr_noisy`` (dB, of the
     displayed images) are of the iteration's own output, as published; ``color`` is the running average that
     the method gives as its result, linear radiance of shape (height, width, 3).
     """
@@ -40,7 +40,7 @@ def paper_curve(
     from tungsten_dip.fit.published.fit import PaperFit
 
     start = time.perf_counter()
-    looking_s = 0.0
+    sampling_s = 0.0
     points = []
     total = max(checkpoints)
     buffers = prepared(buffers, threads=settings.threads).buffers
@@ -50,11 +50,11 @@ def paper_curve(
             fit.step()
             progress(iteration / total, f"iteration {iteration}, PSNR to noisy {fit.psnr:.2f} dB")
             if iteration in checkpoints:
-                looked = time.perf_counter()
+                paused = time.perf_counter()
                 color = fit.color()
-                seconds = looked - start - looking_s
+                seconds = paused - start - sampling_s
                 points.append(PaperPoint(iteration, seconds, fit.loss, fit.psnr, color))
-                looking_s += time.perf_counter() - looked
+                sampling_s += time.perf_counter() - paused
     return points
 
 

@@ -1,4 +1,4 @@
-"""The published method's table of 13 rows on a set with a reference, and what its iterations do."""
+"""The published method's table of 13 rows on a set with a reference, and its quality over the iterations."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ SCENES = ("cornell-box", "car2", "lamp")
 """The scenes of which all 13 rows are published."""
 
 TOO_MANY = 10 / 3
-"""How far beyond the iterations of the table the figure goes: the published one shows 10000 beside 3000."""
+"""Iterations of the figure over those of the table: 10000 and 3000 in the publication."""
 
 TOO_FEW = 30
-"""The first image of the figure comes after the iterations of the table over this."""
+"""Iterations of the table over those of the first image of the figure."""
 
 COLUMNS = (
     "row",
@@ -115,11 +115,11 @@ def run_paper_table(
 ) -> str:
     """Fit every row, and return the table in Markdown, the published figures of ``scene`` beside ours.
 
-    ``rows`` None takes all 13. The folder is one of a `Runner`, in which a run goes on where it stopped; in
-    the end it holds ``paper.md`` and ``paper.csv`` with the rows that are known, and, with ``figure``,
+    ``rows`` None takes all 13. The folder is one of a `Runner`, in which a run resumes; in
+    the end it contains ``paper.md`` and ``paper.csv`` with the rows that are known, and, with ``figure``,
     ``iterations.svg`` and ``iterations.png``.
 
-    A row that lacks its feature is left out, and the log says so.
+    A row whose feature is missing is left out and logged.
 
     Raises InputError if a row is not one of the 13.
     """

@@ -65,11 +65,11 @@ def run_pareto(
 
 
 def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
-    """Load every library that is about to be measured, so that no measurement pays for it."""
+    """Load every library that is about to be measured, so that no measurement includes it."""
     height, width = bench_set.buffers.height, bench_set.buffers.width
     middle = [slice(max(0, size // 2 - 32), size // 2 + 32) for size in (height, width)]
     tiny = cropped(bench_set.buffers, (middle[0], middle[1]))
-    logging.disable()  # nobody asked for a picture of this
+    logging.disable()  # its results are discarded
     try:
         _warm_up_with(tiny, plan, series)
     finally:

@@ -41,7 +41,7 @@ class PlainSkip(nn.Module):
         self.head = nn.Conv2d(channels[0], 3, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return the image that the network makes of its input."""
+        """Return the network's output for an input."""
         sides = []
         x = image
         for down, side in zip(self.down, self.side, strict=True):

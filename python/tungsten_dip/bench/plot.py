@@ -35,7 +35,7 @@ METRICS = (
 
 MARKERS = dict(zip(SERIES, "oosD^v", strict=True))
 LINE_POINTS = 50
-"""Where words are put, a line between two points counts as this many points that are in the way."""
+"""Points by which a line between two points is represented when labels avoid it."""
 
 _JOINED = (OURS, IN_TIME, PAPER, SAMPLES, OIDN)
 
@@ -116,7 +116,7 @@ def _figure(width: float, height: float) -> Iterator[Figure]:
 
 
 def _style(axes: Axes, colors: Colors) -> None:
-    """Take from axes all that carries nothing."""
+    """Remove all that is not informative from axes."""
     axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
     axes.patch.set_visible(False)
     axes.tick_params(which="both", length=0, labelcolor=colors.soft)
@@ -126,7 +126,7 @@ def _style(axes: Axes, colors: Colors) -> None:
 
 @dataclass(frozen=True)
 class _Mark:
-    """A word in a colour that belongs beside a point of a plot."""
+    """A label beside a point of a plot, and its colour."""
 
     word: str
     seconds: float
@@ -183,7 +183,7 @@ def _end_with_the_better(axes: Axes, rows: Sequence[Row], metric: str) -> None:
 
 
 def _write_marks(figure: Figure, drawn: Sequence[tuple[Axes, Sequence[_Mark]]]) -> None:
-    """Write the marks beside their points, each where the least is in the way."""
+    """Write the marks beside their points, each where it overlaps least."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     point = figure.dpi / 72

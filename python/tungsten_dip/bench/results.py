@@ -1,4 +1,4 @@
-"""Measurements in a CSV file that grows row by row, so that a run goes on where the last one stopped."""
+"""Measurements in a CSV file that grows row by row, so that an interrupted run can be resumed."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Key:
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement(Comparison):
-    """One row: the key, what it took and how far from the reference it is.
+    """One row: the key, its cost and its error against the reference.
 
-    ``seconds`` is None where an image was saved and nobody knows what it took. ``loss`` and ``psnr_noisy``
+    ``seconds`` is None for a saved image whose time is unknown. ``loss`` and ``psnr_noisy``
     are those of the published method's iteration.
     """
 
@@ -68,7 +68,7 @@ class Results:
         return key in self._by_key
 
     def add(self, measurements: Iterable[Measurement]) -> None:
-        """Add rows and write the file anew, whole or not at all."""
+        """Add rows and rewrite the file, whole or not at all."""
         self._by_key |= {row.key: row for row in measurements}
         with replacing(self._path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")

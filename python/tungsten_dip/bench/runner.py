@@ -1,4 +1,4 @@
-"""Runs methods that have not been run yet, and keeps what they gave as soon as they gave it."""
+"""Runs methods that have not been run yet, and saves every result as soon as it is there."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Runner:
     """
 
     def __init__(self, folder: Path, threads: int | None) -> None:
-        """Open the folder, which is made if need be.
+        """Open the folder, which is created if needed.
 
         Raises InputError if it cannot be written or holds something else.
         """
@@ -49,7 +49,7 @@ class Runner:
         self._machine = machine_key(threads)
 
     def missing(self, tasks: Sequence[Task]) -> list[Task]:
-        """Return those of the tasks that are yet to be run."""
+        """Return the tasks that have not been run."""
         return [
             task
             for task in tasks
@@ -57,7 +57,7 @@ class Runner:
         ]
 
     def run(self, tasks: Sequence[Task], progress: Progress) -> None:
-        """Run the tasks in turn. KeyboardInterrupt loses the task in hand and no other."""
+        """Run the tasks in turn. KeyboardInterrupt loses only the current task."""
         for index, task in enumerate(tasks):
             start, end = index / len(tasks), (index + 1) / len(tasks)
             part = part_of(progress, start, end, task.method.labels[-1])
@@ -74,7 +74,7 @@ class Runner:
         return self._results.medians(self._key(Task(bench_set, method), label), repeats)
 
     def image(self, bench_set: BenchSet, label: str) -> FloatImage | None:
-        """Return the image of a label's first repeat, unless somebody has removed it."""
+        """Return the image of a label's first repeat, or None if its file was removed."""
         path = self._image_path(bench_set, label)
         return read_image(path) if path.exists() else None
 
@@ -97,6 +97,6 @@ class Runner:
         )
 
     def _image_path(self, bench_set: BenchSet, label: str) -> Path:
-        # Names alone do not tell sets apart: a folder may hold the measurements of several of one name.
+        # Several sets in one folder may have the same name, hence the digest.
         name = re.sub(r"[^a-z0-9]+", "-", f"{bench_set.name} {bench_set.digest[:8]} {label}".lower())
         return self._folder / "images" / f"{name}.exr"

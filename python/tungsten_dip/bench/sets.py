@@ -1,4 +1,4 @@
-"""What is measured on: buffers that were saved, and the reference that their denoised image should be."""
+"""Sets to measure on: saved buffers and a reference for their denoised image."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _read_set(text: str) -> BenchSet:
     buffers, reference = read_buffers(path), read_image(reference_path)
     _check_size(reference_path, reference, path, buffers)
     if not np.isfinite(reference).all():
-        raise InputError(f"{reference_path}: expected a finite reference, got NaN or Inf; render it anew")
+        raise InputError(f"{reference_path}: expected a finite reference, got NaN or Inf; render it again")
     nfor_path = _folder(path) / NFOR
     nfor = read_image(nfor_path) if nfor_path.exists() else None
     if nfor is not None:

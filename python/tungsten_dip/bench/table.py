@@ -1,4 +1,4 @@
-"""What was found, set by set: medians as rows, in Markdown and as texts."""
+"""The results of every set: medians as rows, in Markdown and as texts."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def cells(row: Row) -> list[str]:
 
 
 def seconds_text(seconds: float | None) -> str:
-    """Return seconds with two digits, or nothing where nobody knows them."""
+    """Return seconds with two digits, or an empty text if unknown."""
     if seconds is None:
         return ""
     return f"{seconds:#.2g}" if seconds < 10 else f"{seconds:.0f}"
 
 
 def repeats_text(repeats: int) -> str:
-    """Return how a figure came about."""
+    """Return how many runs a figure comes from."""
     return "one run each" if repeats == 1 else f"medians of {repeats} interleaved runs"

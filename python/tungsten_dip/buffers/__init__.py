@@ -1,4 +1,4 @@
-"""Buffers of a render: the data model, files, mending, statistics of the noise, pre-filtering of features."""
+"""Buffers of a render: the data model, files, sanitising, checks of half buffers, pre-filtering."""
 
 from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
 from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent

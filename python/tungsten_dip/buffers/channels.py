@@ -1,4 +1,4 @@
-"""The mean over a pixel's channels, written out: numpy's own crawls along an axis of three."""
+"""The mean over a pixel's channels, written out: numpy's is slow along an axis of three."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether half buffers are what they are called: halves of the image's samples, with independent noise."""
+"""Checks that half buffers are halves of the image's samples, with independent noise."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
     Halves of a low-discrepancy sampler mirror each other (Tungsten's Sobol sampler: correlation -0.2), and
     halves may be copies of one image. The correlation is taken of what a second-order difference leaves of
     both halves; where texture makes it positive, the sample variance decides, if it is known. Without
-    halves, and where nothing in the image tells, ``independent`` is False. Expects sanitised buffers.
+    halves, and where the image does not show it, ``independent`` is False. Expects sanitised buffers.
     """
     color = buffers.color
     if color.halves is None:
@@ -40,8 +40,8 @@ def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> Ha
 def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Return buffers without those halves whose mean is not the image, and a line for each quantity.
 
-    Such halves were left by another render, or belong to another layer (two light groups named A and B, say).
-    Expects buffers as they were rendered: sanitising moves mean and halves apart, and mends one by the other.
+    Such halves were left by another render, or belong to another layer (such as light groups named A and B).
+    Expects buffers as rendered: sanitising changes mean and halves, and repairs one from the other.
     """
     foreign = [name for name, buffer in buffers.quantities() if not _halves_belong(buffer)]
     alone: dict[str, Buffer | None] = {}
@@ -49,17 +49,16 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
         buffer: Buffer = getattr(buffers, name)
         alone[name] = Buffer(buffer.mean, variance=buffer.variance)
     lines = tuple(
-        f"{name}: the half buffers are those of another picture (their mean is not the image), not used"
+        f"{name}: the half buffers are not used: their mean is not the image, so they are of another image"
         for name in foreign
     )
     return buffers.with_quantities(**alone), lines
 
 
 def _halves_belong(buffer: Buffer) -> bool:
-    """Whether nearly every pixel is the mean of its halves, but for rounding and halves of unequal size.
+    """Whether nearly every pixel is the mean of its halves, except for rounding and halves of unequal size.
 
-    Pixels that are 0 in all three say nothing, and most of an image may be so; nor do
-    those that are not finite.
+    Pixels that are 0 in all three, which most of an image may be, and those that are not finite, are ignored.
     """
     if buffer.halves is None:
         return True
@@ -70,6 +69,6 @@ def _halves_belong(buffer: Buffer) -> bool:
     )
     with np.errstate(invalid="ignore"):
         apart, noise, level = (abs(image).sum(axis=1) for image in ((a + b) / 2 - mean, (a - b) / 2, mean))
-    telling = np.isfinite(apart + noise + level) & (apart + noise + level > 0)
-    foreign = telling & (apart > _UNEQUAL * noise + _ROUNDED * level)
-    return bool(np.count_nonzero(foreign) <= _FOREIGN_SHARE * np.count_nonzero(telling))
+    informative = np.isfinite(apart + noise + level) & (apart + noise + level > 0)
+    foreign = informative & (apart > _UNEQUAL * noise + _ROUNDED * level)
+    return bool(np.count_nonzero(foreign) <= _FOREIGN_SHARE * np.count_nonzero(informative))

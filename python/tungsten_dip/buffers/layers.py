@@ -32,10 +32,10 @@ PLANES = {"mean": "", "half_a": "A", "half_b": "B", "variance": "Variance"}
 """The fields of a Buffer, and what Tungsten appends to a quantity's name for each."""
 
 MAP_KEYS = (*(quantity + suffix for quantity in CHANNELS for suffix in PLANES.values()), "alpha")
-"""What a user can say with --map: color, colorA, colorB, colorVariance, albedo, ..., alpha."""
+"""The keys of --map: color, colorA, colorB, colorVariance, albedo, ..., alpha."""
 
 NOTHING = "none"
-"""The value of --map that says: do not use this quantity."""
+"""The value of --map that excludes a quantity."""
 
 _COMPONENTS = ("RGB", "XYZ", ("RED", "GREEN", "BLUE"))
 
@@ -47,17 +47,17 @@ Layers = dict[str, dict[str, str]]
 
 @dataclass(frozen=True)
 class Found:
-    """What was recognised: channel names per key of --map, and the layers that nobody claimed."""
+    """What was recognised: channel names per key of --map, and the layers that are not used."""
 
     channels: dict[str, tuple[str, ...]]
     ignored: tuple[str, ...]
 
 
 def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], default: str = "") -> Found:
-    """Decide what is what, from the names of the channels and from what the user said.
+    """Assign channels to quantities, by the names of the channels and by ``mapping``.
 
     A value of ``mapping`` is a layer, a channel, several channels joined by commas, or "none". ``default`` is
-    the layer that is the colour if none has a telling name, unless its name tells of something else.
+    the layer that is the colour if no layer is named so, unless its own name is that of another quantity.
 
     Raises InputError if a mapping names what is not there, or if no colour is found.
     """
@@ -130,10 +130,10 @@ _COMPOSITE = "composite."
 
 
 def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] | None:
-    """Find the best layer, and what stands before the alias in its name (a Blender view layer).
+    """Find the best layer, and what precedes the alias in its name (a Blender view layer).
 
-    Of several view layers the colour is that of the one which holds most; features of another one than the
-    colour's show something else.
+    Of several view layers, the colour is taken from the one that contains most layers, and features only from
+    the same one: those of others show other objects.
     """
     matches = []
     for layer in layers:

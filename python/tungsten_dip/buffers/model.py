@@ -1,4 +1,4 @@
-"""The data model: one image's worth of evidence, as numpy arrays.
+"""The data model: the buffers of one image, as numpy arrays.
 
 Arrays are float32, C-contiguous, shape (height, width, channels), row 0 at the top. Colour is linear
 radiance, normals are in world space with components in [-1, 1], depth is a distance along the ray (0 where it
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FloatImage = npt.NDArray[np.float32]
 
 Halves = tuple[FloatImage, FloatImage]
-"""An image made of half A of the samples alone, and one of the same shape made of half B alone."""
+"""An image made only of half A of the samples, and one of the same shape made only of half B."""
 
 FloatArray = npt.NDArray[np.float32]
 """Of any shape that is not an image's."""
@@ -36,7 +36,7 @@ FEATURES = ("albedo", "normal", "depth")
 
 @dataclass(frozen=True, eq=False)
 class Buffer:
-    """One quantity of an image: its mean over all samples and, where known, what is known of its noise.
+    """One quantity of an image: its mean over all samples and, where known, its halves and its variance.
 
     ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the
     variance of ``mean`` (not of one sample). All have the shape of ``mean``.
@@ -67,14 +67,14 @@ class Buffer:
 
 @dataclass(frozen=True, eq=False)
 class RenderBuffers:
-    """Everything a renderer tells of one image.
+    """Everything a renderer outputs for one image.
 
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies.
     ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
     (None for buffers that are not those of a file).
 
-    Raises InputError if the shapes or the channel counts do not fit together, or an array is no C-contiguous
+    Raises InputError if the shapes or the channel counts do not fit together, or an array is not C-contiguous
     float32.
     """
 

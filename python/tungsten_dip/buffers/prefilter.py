@@ -26,9 +26,9 @@ def prefilter_features(
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
     Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it.
     Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A
-    feature without halves is filtered with weights of its own, by the noise that its second differences
-    tell. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every core.
-    ``passes`` are radius, step and standard deviations of each, None those that guides of a regression need.
+    feature without halves is filtered with weights of its own, by the noise estimated from its second
+    differences. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every
+    core. ``passes`` are radius, step and standard deviations of each; None: those for guides of a regression.
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
@@ -49,7 +49,7 @@ def prefilter_features(
                     threads=thread_count(threads),
                 )
             if name != "normal":
-                # Where negative values were mended, the mean is not that of the halves, and may fall below 0.
+                # Where negative values were repaired, the mean is not that of the halves and may be negative.
                 np.maximum(mean, 0, out=mean)
             filtered[name] = Buffer(mean, half_a, half_b, variance)
             if feature.halves is None:
@@ -58,7 +58,7 @@ def prefilter_features(
 
 
 def noise_in(image: FloatImage, threads: int) -> FloatImage:
-    """Return the variance of an image's noise, told by itself; the mean over the 5x5 pixels around.
+    """Return the variance of an image's noise, estimated from the image, as means over 5x5 pixels.
 
     Immerkaer's stencil (1996, "Fast Noise Variance Estimation") leaves of an image what is neither constant
     nor linear in either direction: noise, and edges.

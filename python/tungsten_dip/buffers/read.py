@@ -39,7 +39,7 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     multi-layer or multi-part EXR. ``mapping`` settles what its names leave open: ``{"color": "beauty"}``.
     Its keys are the quantities and ``alpha``, quantities also with ``A``, ``B`` (halves) and ``Variance``
     (of the mean). A value is a layer, a channel, channels joined by commas, for a folder a file name, or
-    ``none``. Values of pixels are taken as they are: nothing is mended.
+    ``none``. Values of pixels are not changed: nothing is sanitised.
 
     Raises InputError if a file is missing, damaged or no image, if sizes differ, or if there is no colour.
     """
@@ -153,7 +153,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected renderer.output_buffers such as "
-            '[{"type": "color", "hdr_output_file": "color.exr"}]; mend the scene'
+            '[{"type": "color", "hdr_output_file": "color.exr"}]; correct the scene'
         ) from error
     if "color" not in files:
         raise InputError(
@@ -178,7 +178,7 @@ def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) 
     channels = {
         f"{key}.{name}": channel for key, part in parts.items() for name, channel in part.channels.items()
     }
-    # The layers have the names that we gave them; what else a file holds is carried along under its key.
+    # The layers have the names given here; other channels of a file are kept under its key.
     return _from_source(path, Source((Part(channels, color.attributes),)), color.attributes)
 
 

@@ -1,4 +1,4 @@
-"""Mending of values that no renderer can have meant, before anything is computed from them."""
+"""Repairs values that no renderer can have meant, before anything is computed from them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ _PLANES = ("", " half A", " half B", " variance")
 
 
 def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[RenderBuffers, tuple[str, ...]]:
-    """Mend NaN, infinite and negative values; return buffers and, for the log, a line per mended quantity.
+    """Repair NaN, infinite and negative values; return buffers and a log line per repaired quantity.
 
     No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative), and so does an
-    infinite depth (1e9 and more), which marks the sky. What a filter's negative lobes lack is taken from the
-    radiance around, so that the mean stays. Everything else, also normals of 1e6 and an albedo of
+    infinite depth (1e9 and more), which marks the sky. The energy of a filter's negative lobes is taken from
+    the radiance around, so that the mean is preserved. Everything else, also normals of 1e6 and an albedo of
     1e12 and more, is rebuilt: the mean and the halves from one another, a variance from the halves, and what
-    remains from the sane pixels around it or, far from any, from the half that is sane.
-    Arrays without defects are shared with ``buffers``, which are not modified. ``threads`` None uses every
-    core.
+    remains from the valid pixels around it or, far from any, from the half that is valid. Arrays without
+    defects are shared with ``buffers``, which are not modified. ``threads`` None uses every core.
     """
-    mended: dict[str, Buffer | None] = {}
+    repaired: dict[str, Buffer | None] = {}
     lines = []
     for quantity, buffer in buffers.quantities():
         planes, defects = _core.sanitize(
@@ -32,9 +31,9 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
             if _counts(counts)
         ]
         if found:
-            mended[quantity] = Buffer(*planes)
-            lines.append(f"mended {'; '.join(found)}")
-    return buffers.with_quantities(**mended), tuple(lines)
+            repaired[quantity] = Buffer(*planes)
+            lines.append(f"repaired {'; '.join(found)}")
+    return buffers.with_quantities(**repaired), tuple(lines)
 
 
 def _counts(defects: _core.Defects) -> str:

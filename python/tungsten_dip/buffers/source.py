@@ -1,4 +1,4 @@
-"""What was read, as it was: raw channels that travel untouched from the input file to the output file."""
+"""What was read: raw channels that are copied unchanged from the input file to the output file."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 import numpy.typing as npt
 
 OWN = "tungsten_dip/"
-"""What the names of our own attributes begin with."""
+"""Prefix of the names of our own attributes."""
 
 ADDED = OWN + "added"
 """Attribute: the channels of the first part that write_denoised added."""
 
 MOVED_TO = OWN + "moved_to"
-"""Attribute: the layer that holds input channels whose names write_denoised took."""
+"""Attribute: the layer that holds input channels whose names write_denoised needed itself."""
 
 MAP = OWN + "map"
 """Attribute: the --map of the input, as JSON."""
@@ -24,7 +24,7 @@ SPP = OWN + "spp"
 """Attribute: samples per pixel."""
 
 FRAME = {"dataWindow", "displayWindow", "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth"}
-"""Attributes of an EXR header that say where the pixels are; the others say where they come from."""
+"""Attributes of an EXR header that describe the position of the pixels; the others describe their origin."""
 
 Channel = npt.NDArray[Any]
 """float16, float32 or uint32, shape (height, width), as in the file."""
@@ -51,7 +51,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Source:
-    """The parts of an input file, the --map that told its layers apart, and which part holds the colour."""
+    """The parts of an input file, the --map that assigned its layers, and which part holds the colour."""
 
     parts: tuple[Part, ...]
     mapping: Mapping[str, str] = field(default_factory=dict)

@@ -36,13 +36,13 @@ LARGEST_HALF = 65504.0
 _DENOISED_PART = "tungsten_dip denoised"
 
 _GREY = ("Y",)
-"""Channels of a picture that must not stand beside another one's red, green and blue."""
+"""Channels of a picture that must not be in one layer with another one's red, green and blue."""
 
 _COMPONENTS = {"color": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Y", "visibility": "Y"}
 
 
 class Denoised(Protocol):
-    """What a fit gives back, as far as it is saved."""
+    """The part of the result of a fit that is saved."""
 
     @property
     def color(self) -> FloatImage:
@@ -58,11 +58,11 @@ class Denoised(Protocol):
 
     @property
     def seconds(self) -> float:
-        """How long the fit took."""
+        """Duration of the fit."""
 
     @property
     def iterations(self) -> int:
-        """How many steps the fit took."""
+        """Number of training steps."""
 
     @property
     def estimated_relmse(self) -> float | None:

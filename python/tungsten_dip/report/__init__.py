@@ -1,1 +1,1 @@
-"""What a result looks like and how good it is: metrics, previews and the HTML page."""
+"""Metrics against a reference, previews and HTML pages."""

@@ -1,7 +1,7 @@
-"""What the HTML pages are made of: the page itself, and its parts as HTML texts that need no network.
+"""Builds self-contained HTML pages: the page itself, and its parts as HTML.
 
 ``page.html`` is the page's frame, ``page.css`` and ``page.js`` are written into it. Texts given to these
-functions are escaped, but for the parts that are HTML themselves.
+functions are escaped, except for parts that are HTML themselves.
 """
 
 from __future__ import annotations

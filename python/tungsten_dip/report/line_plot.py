@@ -13,11 +13,11 @@ LEFT, RIGHT, TOP, BOTTOM = 110, 24, 20, 40
 
 @dataclass(frozen=True)
 class Point:
-    """A place in a plot, as parts of its width and height from the lower left corner, and what it tells."""
+    """A place in a plot, as parts of its width and height from the lower left corner, and its tooltip."""
 
     x: float
     y: float
-    told: str
+    tooltip: str
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Label:
 def line_plot(
     name: str, points: Sequence[Point], below: Iterable[Label], beside: Iterable[Label], height: int
 ) -> str:
-    """Return a curve through points that tell their values, with a gridline at every label beside it."""
+    """Return a curve through points with tooltips, and a gridline at every label beside it."""
     right, bottom = WIDTH - RIGHT, height - BOTTOM
 
     def across(x: float) -> str:
@@ -54,6 +54,6 @@ def line_plot(
     drawn.append(f'<polyline class="curve" points="{line}"/>')
     for point in points:
         place = f'cx="{across(point.x)}" cy="{up(point.y)}" r="3"'
-        drawn.append(f"<circle {place}><title>{escape(point.told)}</title></circle>")
+        drawn.append(f"<circle {place}><title>{escape(point.tooltip)}</title></circle>")
     box = f'viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(name)}"'
     return f'<svg class="curve-plot" {box}>{"".join(drawn)}</svg>'

@@ -1,4 +1,4 @@
-"""How far an image is from its reference, in the field's usual numbers."""
+"""The error of an image against its reference, by the usual metrics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Comparison:
     ``relmse`` and ``hdrflip`` are of linear radiance. ``psnr`` is infinite for equal images, ``ssim`` None
     where a side is under 7 pixels, ``hdrflip`` None where the reference is uniform, which leaves no range of
     exposures. ``ssim``, ``flip`` and ``hdrflip`` are None too where the packages that compute them are not
-    installed. ``nonfinite`` counts NaN and Inf values of the image, which are taken as 0. ``mean_ratio`` is
+    installed. ``nonfinite`` counts NaN and Inf values of the image, which count as 0. ``mean_ratio`` is
     the mean radiance over the reference's, None where that is black.
     """
 
@@ -65,7 +65,7 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     if image.size == 0:
         raise InputError(f"compare: expected an image with pixels, got one of shape {image.shape}")
     if not np.isfinite(reference).all():
-        raise InputError("compare: expected a finite reference, got one with NaN or Inf; render it anew")
+        raise InputError("compare: expected a finite reference, got one with NaN or Inf; render it again")
 
     for package, metric in _METRIC_BY_PACKAGE.items():
         if find_spec(package) is None:

@@ -1,4 +1,4 @@
-"""The report of one fit: a page that needs no network, with the pictures, the error and what led to them."""
+"""The report of one fit: a self-contained page with the images, the error, its history and the settings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tungsten_dip.scene.tonemap import display_from_radiance
 
 _CURVE_HEIGHT = 260
 _SKY_DEPTH = 1e9
-"""What `buffers.sanitize` takes for infinite (cpp/sanitize.cpp)."""
+"""The depth from which `buffers.sanitize` treats it as infinite (cpp/sanitize.cpp)."""
 
 
 def report_page(
@@ -27,8 +27,8 @@ def report_page(
 ) -> str:
     """Return the page for one fit, its pictures displayed with one of Tungsten's tonemaps.
 
-    ``remarks`` are lines on the input (what was taken for what, what was mended); the fit's notes follow,
-    except for those that are among the remarks already.
+    ``remarks`` are lines on the input (how its layers were assigned, what was repaired); the fit's notes
+    follow, except for those that are among the remarks already.
     """
     features = list(_features(buffers))
     pictures = [
@@ -47,7 +47,7 @@ def report_page(
         "<h2>Settings</h2>",
         html.facts(_settings(result)),
         "<h2>Notes</h2>",
-        html.bullets(notes) if notes else "<p>Nothing was missing and nothing had to be mended.</p>",
+        html.bullets(notes) if notes else "<p>Nothing was missing and nothing was repaired.</p>",
     ]
     return html.page(title, _subtitle(buffers), body)
 
@@ -80,7 +80,7 @@ def _subtitle(buffers: RenderBuffers) -> str:
     size = f"{buffers.width} x {buffers.height} pixels"
     spp = "" if buffers.spp is None else f", {float(np.mean(buffers.spp)):g} samples per pixel"
     features = [name for name, _ in buffers.quantities() if name in FEATURES]
-    return f"{size}{spp}, guided by {', '.join(features) or 'the colour alone'}"
+    return f"{size}{spp}, guided by {', '.join(features) or 'the colour only'}"
 
 
 def _figures(result: FitResult) -> Iterable[tuple[str, str]]:
@@ -111,7 +111,7 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
     # An estimate without bias may fall below zero where the error is tiny; a logarithm cannot show it.
     known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
     if len(known) < 2:
-        return "<p>Nothing independent was there to judge by, so the error was not estimated on the way.</p>"
+        return "<p>There were no independent halves, so the error was not estimated during the fit.</p>"
     end_s = max(known[-1][0].seconds, 1e-9)
     ticks = _round_ticks(min(relmse for _, relmse in known), max(relmse for _, relmse in known))
     bottom, top = math.log10(ticks[0]), math.log10(ticks[-1])
@@ -140,7 +140,7 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
 
 
 def _round_ticks(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 times powers of ten, the powers alone where these are many, that enclose a range."""
+    """Return 1, 2 and 5 times powers of ten, or only the powers if there are many, enclosing a range."""
     exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 2)
     digits = (1, 2, 5) if len(exponents) <= 4 else (1,)
     ticks = [float(f"{digit}e{exponent}") for exponent in exponents for digit in digits]

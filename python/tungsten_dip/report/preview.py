@@ -1,4 +1,4 @@
-"""Pictures for the eye, as display-referred values in [0, 1]: side by side, and errors in false colour."""
+"""Pictures to look at, as display-referred values in [0, 1]: side by side, and errors in false colour."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Which effects a scene calls for, and which buffers say something of it.
+"""Which effects a scene uses, and which buffers are informative for it.
 
-That nothing else is simulated is for the hosts to see to: docs/scenes.md says how.
+The hosts simulate nothing else: docs/scenes.md describes how.
 """
 
 from __future__ import annotations
@@ -62,16 +62,15 @@ _ALWAYS_SPECULAR = (ConductorBsdf, DielectricBsdf, ForwardBsdf, MirrorBsdf, Thin
 _ENVIRONMENT = (InfiniteSphere, InfiniteSphereCap, Skydome)
 
 _DEFAULT_SKY = "white sky (no light is in the scene)"
-"""What Tungsten lights a scene with that has no light of its own."""
+"""The light that Tungsten adds to a scene without lights."""
 
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects that a scene calls for. Every field lists the objects that call for it; empty: nothing
-    does.
+    """The effects that a scene uses. Every field lists the objects that use it, and is empty if none does.
 
     Only what is in use counts: BSDFs on primitives, media that fill something and are not empty, lights that
-    shine.
+    emit.
     """
 
     depth_of_field: tuple[str, ...]
@@ -95,7 +94,7 @@ class Decision:
 
 
 def effects_of(scene: Scene) -> Effects:
-    """Return the effects that a scene calls for."""
+    """Return the effects that a scene uses."""
     primitives = list(_primitives(scene))
     bsdfs = list(_bsdfs(primitives))
     media = [
@@ -105,10 +104,10 @@ def effects_of(scene: Scene) -> Effects:
         media.append(scene.camera.medium)
     textured: list[Bsdf | Primitive] = [
         *bsdfs,
-        *(primitive for primitive in primitives if _may_shine(primitive)),
+        *(primitive for primitive in primitives if _may_emit(primitive)),
     ]
-    environments = _names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _may_shine(p))
-    if not any(_may_shine(primitive) for primitive in scene.primitives):
+    environments = _names(p for p in primitives if isinstance(p, _ENVIRONMENT) and _may_emit(p))
+    if not any(_may_emit(primitive) for primitive in scene.primitives):
         environments = (_DEFAULT_SKY,)
     aperture = scene.camera.aperture_size if isinstance(scene.camera, ThinlensCamera) else 0.0
     return Effects(
@@ -130,9 +129,9 @@ def decision_of(scene: Scene) -> Decision:
     left_out = _reasons_without_information(scene, effects_of(scene))
     informative: dict[BufferName, str] = {
         "color": "the image itself",
-        "albedo": "tells surfaces of different colours apart",
-        "normal": "tells surfaces of different orientation apart",
-        "depth": "tells near from far",
+        "albedo": "distinguishes surfaces of different colours",
+        "normal": "distinguishes surfaces of different orientation",
+        "depth": "distinguishes near from far",
     }
     return Decision(
         buffers=tuple(name for name in informative if name not in left_out),
@@ -141,7 +140,7 @@ def decision_of(scene: Scene) -> Decision:
 
 
 def inspect_facts(scene: Scene) -> dict[str, Any]:
-    """Return what `inspect_text` says as plain objects for JSON."""
+    """Return the content of `inspect_text` as plain objects for JSON."""
     return {
         "scene": str(scene.path),
         "width": scene.camera.resolution[0],
@@ -157,14 +156,14 @@ def inspect_facts(scene: Scene) -> dict[str, Any]:
 
 
 def inspect_text(scene: Scene) -> str:
-    """Return the effects that a scene calls for and what follows from them, as a table for people."""
+    """Return the effects that a scene uses and the buffers of a fit, as a table to read."""
     effects, decision = effects_of(scene), decision_of(scene)
     width, height = scene.camera.resolution
     lines = [
         f"{scene.path}: {width} x {height} pixels, {scene.renderer.spp} samples per pixel, "
         f"{len(scene.primitives)} primitives",
         "",
-        "effect               called for by",
+        "effect               used by",
     ]
     for field in fields(effects):
         value = getattr(effects, field.name)
@@ -178,7 +177,7 @@ def inspect_text(scene: Scene) -> str:
     if scene.integrator.kind != PathTracer.kind:
         lines += [
             "",
-            f"{scene.integrator.kind}: Tungsten writes colour alone, Mitsuba has only the path_tracer",
+            f"{scene.integrator.kind}: Tungsten writes only colour, Mitsuba has only the path_tracer",
         ]
     return "\n".join(lines)
 
@@ -194,7 +193,7 @@ def _reasons_without_information(scene: Scene, effects: Effects) -> dict[BufferN
         if not effects.environment_light:
             reasons["albedo"] = "nothing is in the scene"
         return reasons
-    if effects.environment_light or any(_may_shine(surface) for surface in surfaces):
+    if effects.environment_light or any(_may_emit(surface) for surface in surfaces):
         # Emitters add their radiance to the albedo, and the sky is written as one.
         return reasons
     if any(isinstance(surface, MinecraftMap) for surface in surfaces):
@@ -206,7 +205,7 @@ def _reasons_without_information(scene: Scene, effects: Effects) -> dict[BufferN
 
 
 def _written_albedos(surface: Primitive) -> Iterator[Texture]:
-    """Yield what Tungsten writes as albedo: that of the outermost BSDF, but it looks through transparency."""
+    """Yield what Tungsten writes as albedo: that of the outermost BSDF, or of the base of a transparency."""
     bsdfs = surface.bsdf if isinstance(surface, Mesh) else (getattr(surface, "bsdf", None),)
     for bsdf in bsdfs:
         if isinstance(bsdf, TransparencyBsdf):
@@ -256,8 +255,8 @@ def _varies(texture: Texture) -> bool:
     return _constant_value(texture) is None
 
 
-def _may_shine(primitive: Primitive) -> bool:
-    """Whether a primitive is a light; an image is taken to hold some, as it is not read here."""
+def _may_emit(primitive: Primitive) -> bool:
+    """Whether a primitive is a light; an image, which is not read here, is assumed to emit."""
     if isinstance(primitive, Skydome):
         return primitive.intensity > 0.0
     return primitive.emitter is not None and _constant_value(primitive.emitter) != (0.0, 0.0, 0.0)

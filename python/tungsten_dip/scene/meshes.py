@@ -65,13 +65,13 @@ class CurveSet:
 
 
 def mesh_geometry(mesh: Mesh) -> TriangleMesh:
-    """Read a mesh as Tungsten shows it: with the normals computed anew if the scene asks for that."""
+    """Read a mesh as Tungsten renders it: with recomputed normals if the scene sets that."""
     read = read_mesh(mesh.file)
     return with_smooth_normals(read) if mesh.smooth and mesh.recompute_normals else read
 
 
 def curve_geometry(curves: Curves) -> CurveSet:
-    """Read curves as Tungsten shows them: with the thickness and the taper of the scene."""
+    """Read curves as Tungsten renders them: with the thickness and the taper of the scene."""
     read = read_curves(curves.file)
     nodes, ends = read.nodes.copy(), read.ends
     if curves.curve_thickness is not None:
@@ -104,7 +104,7 @@ def read_mesh(path: Path) -> TriangleMesh:
     for name, array in (("normals", mesh.normals), ("texture coordinates", mesh.uvs)):
         bad = ~np.isfinite(array)
         if bad.any():
-            _LOG.warning("%s: %d %s are not finite and are taken for 0", path, int(bad.sum()), name)
+            _LOG.warning("%s: %d %s are not finite and are replaced by 0", path, int(bad.sum()), name)
             array[bad] = 0.0
     return mesh
 
@@ -112,7 +112,7 @@ def read_mesh(path: Path) -> TriangleMesh:
 def read_curves(path: Path) -> CurveSet:
     """Read a .fiber or .hair file.
 
-    Raises InputError if it is neither, is cut off, or holds counts or positions that make no sense.
+    Raises InputError if it is neither, is cut off, or holds invalid counts or positions.
     """
     readers = {".fiber": _curves_from_fiber, ".hair": _curves_from_hair}
     if path.suffix.lower() not in readers:
@@ -215,7 +215,7 @@ def _bytes_of(path: Path) -> bytes:
 
 
 class _Bytes:
-    """A file in memory that is read from front to back and knows where it ends."""
+    """A file in memory that is read from front to back, with checks of its end."""
 
     def __init__(self, path: Path, content: bytes, offset: int = 0) -> None:
         self.path = path
@@ -305,7 +305,7 @@ def _mesh_from_obj(path: Path, content: bytes) -> TriangleMesh:
             triangles.extend((fan[0], fan[i], fan[i + 1]) for i in range(1, len(fan) - 1))
 
     indices = np.array(list(triples), np.int64).reshape(-1, 3)
-    # Index 0 stands for what the corner leaves out.
+    # Index 0 marks what the corner leaves out.
     defaults = {"v": [0.0, 0.0, 0.0], "vt": [0.0, 0.0], "vn": [0.0, 1.0, 0.0]}
     with np.errstate(over="ignore"):
         arrays = {kind: np.array([defaults[kind], *rows]).astype(np.float32) for kind, rows in tables.items()}

@@ -1,9 +1,8 @@
-"""Reads a Tungsten scene file; everything that is wrong with it is found here and said in one line.
+"""Reads a Tungsten scene file; every error in it is found here and reported in one line.
 
 Follows Tungsten where it is lenient: comments and trailing commas are allowed, of two equal keys or names the
-first wins, fields that it does not know are ignored (and reported once). Stricter than Tungsten where it
-would render something else without a word: missing files, numbers that are not finite, names that lead
-nowhere.
+first is used, unknown fields are ignored (and reported once). Stricter than Tungsten where it would silently
+render something else: missing files, numbers that are not finite, names of objects that do not exist.
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ from tungsten_dip.scene.types import (
 _LOG = logging.getLogger(__name__)
 
 MAX_NESTED_BSDFS = 256
-"""BSDFs that one BSDF may be made of, counting what it names as often as it does.
+"""BSDFs that one BSDF may contain, each counted as often as it is named.
 
 Bounds what a host must walk.
 """
 
-# What a family of types is called in messages.
+# Names of the families of types in messages.
 _FAMILIES: dict[type, str] = {
     Texture: "texture",
     Bsdf: "BSDF",
@@ -75,16 +74,16 @@ _FAMILIES: dict[type, str] = {
     Integrator: "integrator",
 }
 
-# Fields that files carry and Tungsten reads nowhere: no reason for a warning.
+# Fields that are common in files and ignored by Tungsten: no reason for a warning.
 _HARMLESS = {"type", "name", "bump_strength"}
-# Lights without a surface carry one all the same in files that Tungsten has written.
+# Lights without a surface have a BSDF in files written by Tungsten.
 _HARMLESS_IN_LIGHTS = _HARMLESS | {"bsdf"}
 
 _T = TypeVar("_T")
 
 
 def load_scene(path: Path | str, input_directory: Path | str | None = None) -> Scene:
-    """Read a scene file. Files that it names are looked for in ``input_directory``, or else beside it.
+    """Read a scene file. Files that it names are searched in ``input_directory``, else beside it.
 
     Raises InputError, one line with the file, the place in it (such as ``primitives[3].bsdf``) and the
     remedy.
@@ -98,7 +97,7 @@ def load_scene(path: Path | str, input_directory: Path | str | None = None) -> S
 
 
 def _types_by_name(family: type[Any]) -> dict[str, type[Any]]:
-    """Return every type of a family by the name that the file calls it."""
+    """Return every type of a family by its name in the file."""
     found: dict[str, type[Any]] = {family.kind: family} if family.kind else {}
     for derived in family.__subclasses__():
         found |= _types_by_name(derived)
@@ -116,7 +115,7 @@ class _Field:
 
 
 def _fields_by_key(cls: type[Any]) -> dict[str, _Field]:
-    """Return the fields of a type by the key that the file calls them."""
+    """Return the fields of a type by their key in the file."""
     hints = get_type_hints(cls, include_extras=True)
     found = {}
     for field in dataclasses.fields(cls):
@@ -141,11 +140,11 @@ _FIELDS_BY_KEY = {
 
 
 class _MissingFileError(InputError):
-    """A file that the scene names is not there."""
+    """A file that the scene names does not exist."""
 
 
 class _Parser:
-    """The state of one reading: what can be named so far, and what was ignored."""
+    """The state while reading: the objects declared so far, and the fields ignored."""
 
     def __init__(self, path: Path, input_directory: Path | None) -> None:
         self.path = path
@@ -203,7 +202,7 @@ class _Parser:
     # --- Values by annotation ---
 
     def value(self, annotation: Any, value: Any, where: str) -> Any:
-        """Read one value of the JSON as its annotation says."""
+        """Read one value of the JSON by its annotation."""
         limits = None
         if get_origin(annotation) is Annotated:
             limits = next((mark for mark in annotation.__metadata__ if isinstance(mark, Range)), None)
@@ -270,7 +269,7 @@ class _Parser:
         return float(value)
 
     def integer(self, value: Any, where: str, limits: Range | None = None) -> int:
-        # Tungsten cuts off what stands after the point.
+        # Tungsten truncates numbers.
         number = int(self.number(value, where)) if isinstance(value, float) else value
         self.number(number, where, limits)
         return int(number)
@@ -338,7 +337,7 @@ class _Parser:
     # --- Objects ---
 
     def typed(self, family: type[_T], value: Any, where: str) -> _T:
-        """Read an object whose class its ``type`` chooses."""
+        """Read an object; its ``type`` selects the class."""
         what = _FAMILIES[family]
         if not isinstance(value, dict):
             raise self.fail(where, f"a {what} object", value, f'write {{"type": ...}} of the {what}')
@@ -354,7 +353,7 @@ class _Parser:
         return ", ".join(sorted(_TYPES_BY_NAME[family]))
 
     def fields(self, cls: type[Any], value: Any, where: str) -> Any:
-        """Read an object field by field, then settle what several fields say together."""
+        """Read an object field by field, then check and combine what depends on several fields."""
         if not isinstance(value, dict):
             raise self.fail(where, "an object", value, "put its fields in { }")
         if cls is VdbGrid and "grid_name" in value:
@@ -423,7 +422,7 @@ class _Parser:
             )
         self.nested_bsdfs[bsdf] = count
 
-    # --- What names of primitives settle ---
+    # --- References to primitives ---
 
     def with_suns_aimed(self, primitives: tuple[Primitive, ...]) -> tuple[Primitive, ...]:
         aimed = []

@@ -1,4 +1,4 @@
-"""Tungsten's five tonemaps: what its PNG files show of linear radiance."""
+"""Tungsten's five tonemaps: how its PNG files display linear radiance."""
 
 from __future__ import annotations
 

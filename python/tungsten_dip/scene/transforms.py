@@ -21,7 +21,7 @@ def matrix_from_transform(
     scale: Vec3 = (1.0, 1.0, 1.0),
     rotation: Vec3 = (0.0, 0.0, 0.0),
 ) -> Matrix:
-    """Return the 4x4 matrix that Tungsten makes of a ``transform`` object.
+    """Return Tungsten's 4x4 matrix of a ``transform`` object.
 
     The axes are made orthonormal and right-handed, starting from those that are given: ``look_at`` gives z,
     ``up`` gives y. They are scaled, then rotated by ``rotation`` (degrees about x, y, z), then moved to
@@ -32,7 +32,7 @@ def matrix_from_transform(
     offset = np.asarray(position, dtype=np.float64)
     axes = {"x": np.array([1.0, 0.0, 0.0]), "y": np.array([0.0, 1.0, 0.0]), "z": np.array([0.0, 0.0, 1.0])}
     given: set[str] = set()
-    # A later source of the same axis wins.
+    # A later source of the same axis is used.
     sources = (("z", look_at), ("y", up), ("x", x_axis), ("y", y_axis), ("z", z_axis))
     for number, (name, direction) in enumerate(sources):
         if direction is not None:

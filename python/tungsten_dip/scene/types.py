@@ -84,7 +84,7 @@ def default_pinhole_frame() -> Matrix:
 class Texture:
     """A colour or a number over the surface.
 
-    Where a number is asked for, it is the mean of a bitmap's RGB, and the first component of any other.
+    Where a number is needed, it is the mean of a bitmap's RGB, or the first component of another texture.
     """
 
     kind: ClassVar[str] = ""
@@ -102,8 +102,8 @@ class ConstantTexture(Texture):
 class BitmapTexture(Texture):
     """An image file. A bare string in the file becomes this too.
 
-    ``gamma_correct`` undoes a gamma of 2.2 in 8-bit colour; HDR images, and images that give a number
-    (roughness, bump, alpha), are taken as they are. ``interpolate`` is bilinear filtering, ``clamp`` stops at
+    ``gamma_correct`` undoes a gamma of 2.2 in 8-bit colour; HDR images, and images that supply a number
+    (roughness, bump, alpha), are not changed. ``interpolate`` is bilinear filtering, ``clamp`` stops at
     the border where the default repeats, ``scale`` multiplies the values.
     """
 
@@ -197,7 +197,7 @@ class Transmittance:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExponentialTransmittance(Transmittance):
-    """Beer and Lambert's law, as everywhere outside Tungsten's non-exponential media."""
+    """Beer and Lambert's law, that of ordinary media."""
 
     kind: ClassVar[str] = "exponential"
 
@@ -306,7 +306,7 @@ class Medium:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HomogeneousMedium(Medium):
-    """The same everywhere; both coefficients are multiplied by ``density``."""
+    """A constant medium; both coefficients are multiplied by ``density``."""
 
     kind: ClassVar[str] = "homogeneous"
     sigma_a: NotNegativeVec3 = (0.0, 0.0, 0.0)
@@ -400,7 +400,7 @@ class MirrorBsdf(Bsdf):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ConductorBsdf(Bsdf):
-    """Polished metal of complex index of refraction ``eta`` + i ``k``, which a named ``material`` has set."""
+    """Polished metal of complex index of refraction ``eta`` + i ``k``, set by ``material`` if it is named."""
 
     kind: ClassVar[str] = "conductor"
     material: str = ""
@@ -422,7 +422,7 @@ class RoughConductorBsdf(Bsdf):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DielectricBsdf(Bsdf):
-    """Clear glass; without ``enable_refraction`` it reflects alone."""
+    """Clear glass; without ``enable_refraction`` it only reflects."""
 
     kind: ClassVar[str] = "dielectric"
     ior: Positive = 1.5
@@ -431,7 +431,7 @@ class DielectricBsdf(Bsdf):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoughDielectricBsdf(Bsdf):
-    """Frosted glass; without ``enable_refraction`` it reflects alone."""
+    """Frosted glass; without ``enable_refraction`` it only reflects."""
 
     kind: ClassVar[str] = "rough_dielectric"
     ior: Positive = 1.5
@@ -531,14 +531,14 @@ class MixedBsdf(Bsdf):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NullBsdf(Bsdf):
-    """Absorbs everything: what lights without a surface of their own carry."""
+    """Absorbs everything: the BSDF of lights without a surface."""
 
     kind: ClassVar[str] = "null"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ForwardBsdf(Bsdf):
-    """Not there: a boundary between media."""
+    """Lets light pass unchanged: a boundary between media."""
 
     kind: ClassVar[str] = "forward"
 
@@ -578,10 +578,10 @@ class RoughWireBsdf(Bsdf):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Primitive:
-    """Something that rays can hit, or that shines.
+    """A surface, or a light.
 
-    ``emission`` is radiance; ``power`` is in watts over the whole surface and wins over it. ``int_medium``
-    fills the inside, ``ext_medium`` the outside.
+    ``emission`` is radiance; ``power`` is in watts over the whole surface and takes precedence.
+    ``int_medium`` fills the inside, ``ext_medium`` the outside.
     """
 
     kind: ClassVar[str] = ""
@@ -594,13 +594,13 @@ class Primitive:
 
     @property
     def emitter(self) -> Texture | None:
-        """What it shines with, if it does: its power or else its emission."""
+        """Its power or else its emission; None if it emits nothing."""
         return self.power or self.emission
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mesh(Primitive):
-    """Triangles from a .wo3 or .obj file; a triangle picks one of ``bsdf`` by its material index.
+    """Triangles from a .wo3 or .obj file; a triangle selects one of ``bsdf`` by its material index.
 
     ``smooth`` interpolates the vertex normals, ``recompute_normals`` (only together with it) computes them
     anew.
@@ -721,7 +721,7 @@ class Skydome(Primitive):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Placement:
-    """Where one instance stands: ``id`` picks the master; of the transform only place and rotation count."""
+    """Where one instance is placed: ``id`` selects the master; only position and rotation are used."""
 
     id: Annotated[int, Range(0, 255)] = 0
     world_from_local: Transform = field(default_factory=identity)
@@ -732,8 +732,8 @@ class Instances(Primitive):
     """Copies of ``masters``: ``instances`` lists them, or a binary file does.
 
     With a second file ``file_b`` every placement is interpolated by ``ratio``. A master is placed by its own
-    transform, then by its placement, then by the transform here, whose scale moves the copies apart but
-    leaves their size alone.
+    transform, then by its placement, then by the transform here, whose scale changes the distances of
+    the copies but not their size.
     """
 
     kind: ClassVar[str] = "instances"
@@ -800,7 +800,7 @@ class ThinlensCamera(PerspectiveCamera):
 
     ``focus_distance`` is measured along the axis; where ``focus_pivot`` names a primitive, it is the distance
     to that. Tungsten's thin lens samples a pixel about its upper left corner, not about its middle as the
-    pinhole does: everything stands half a pixel further right and further down.
+    pinhole does: the image is shifted by half a pixel to the right and down.
     """
 
     kind: ClassVar[str] = "thinlens"
