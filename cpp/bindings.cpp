@@ -224,7 +224,7 @@ NormAct norm_from_arrays(const Numbers& x, const Array& weight, const Array& bia
 }
 
 py::tuple norm_act_arrays(const Numbers& x, const Array& weight, const Array& bias, float epsilon,
-                          float slope, int threads) {
+                          float slope) {
     const NormAct norm = norm_from_arrays(x, weight, bias, epsilon, slope);
     Numbers y({x.shape(0), x.shape(1)});
     Array mean(x.shape(1));
@@ -233,14 +233,14 @@ py::tuple norm_act_arrays(const Numbers& x, const Array& weight, const Array& bi
     const auto [means, scales] = std::pair(mean.mutable_data(), scale.mutable_data());
     {
         const py::gil_scoped_release release;
-        norm_act(norm, from, to, means, scales, threads);
+        norm_act(norm, from, to, means, scales);
     }
     return py::make_tuple(y, mean, scale);
 }
 
 py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, const Array& weight,
                                    const Array& bias, float epsilon, float slope, const Numbers& y,
-                                   const Array& mean, const Array& scale, int threads) {
+                                   const Array& mean, const Array& scale) {
     const NormAct norm = norm_from_arrays(x, weight, bias, epsilon, slope);
     if (y.size() != x.size() || gradient.size() != x.size() || mean.size() != x.shape(1) ||
         scale.size() != x.shape(1)) {
@@ -256,7 +256,7 @@ py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, co
     const auto [weights, biases] = std::pair(by_weight.mutable_data(), by_bias.mutable_data());
     {
         const py::gil_scoped_release release;
-        norm_act_gradient(norm, inputs, outputs, means, scales, by_y, to, weights, biases, threads);
+        norm_act_gradient(norm, inputs, outputs, means, scales, by_y, to, weights, biases);
     }
     return py::make_tuple(by_x, by_weight, by_bias);
 }
@@ -295,9 +295,9 @@ PYBIND11_MODULE(_core, module) {
     module.def("smooth_along_edges", &smooth_along_edges_array, py::arg("image"), py::arg("tensor"),
                py::kw_only(), py::arg("along"), py::arg("across"), py::arg("threads") = 0);
     module.def("norm_act", &norm_act_arrays, py::arg("x").noconvert(), py::arg("weight").noconvert(),
-               py::arg("bias").noconvert(), py::arg("epsilon"), py::arg("slope"), py::arg("threads") = 0);
+               py::arg("bias").noconvert(), py::arg("epsilon"), py::arg("slope"));
     module.def("norm_act_gradient", &norm_act_gradient_arrays, py::arg("gradient").noconvert(),
                py::arg("x").noconvert(), py::arg("weight").noconvert(), py::arg("bias").noconvert(),
                py::arg("epsilon"), py::arg("slope"), py::arg("y").noconvert(), py::arg("mean").noconvert(),
-               py::arg("scale").noconvert(), py::arg("threads") = 0);
+               py::arg("scale").noconvert());
 }

@@ -167,7 +167,8 @@ void smooth_along_edges(ConstImage image, ConstImage tensor, float along, float 
 using BFloat16 = std::uint16_t;  // the upper half of a float
 
 // Batch norm, with the statistics of the image in hand, and leaky ReLU of an image in bfloat16: `pixels` rows
-// of `channels` numbers, with a weight and a bias for each channel. For few channels PyTorch's own is slow.
+// of `channels` numbers, with a weight and a bias for each channel. On one thread: PyTorch's, which run
+// before and after, would not leave their cores to others.
 struct NormAct {
     std::size_t pixels = 0;
     std::size_t channels = 0;
@@ -178,11 +179,11 @@ struct NormAct {
 };
 
 // Writes the output y and, for each channel, the mean and one over the standard deviation.
-void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale, int threads);
+void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale);
 
 // Given these and the gradient of y, writes the gradients of x (which may be y's in place), weight and bias.
 void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y, const float* mean,
                        const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
-                       float* by_bias, int threads);
+                       float* by_bias);
 
 }  // namespace tungsten_dip

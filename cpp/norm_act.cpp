@@ -12,7 +12,8 @@
 namespace tungsten_dip {
 namespace {
 
-// Numbers are summed in chunks, and their sums in order: no result depends on the threads.
+// So many numbers are summed in single precision, the sums of these chunks in double precision. A chunk stays
+// in the processor's cache.
 constexpr std::size_t chunk_numbers = 32768;
 
 // A loop goes over so many numbers at least, the channels several times: it fills the registers.
@@ -51,34 +52,28 @@ class Traversal {
         return values;
     }
 
-    // Calls body(first number, count) for every chunk, from several threads.
+    // Calls body(first number, count) for every chunk.
     template <typename Body>
-    void for_chunks(int threads, const Body& body) const {
-        parallel_for(static_cast<int>(chunks()), threads, [&](int chunk) {
-            const std::size_t first = static_cast<std::size_t>(chunk) * chunk_;
+    void for_chunks(const Body& body) const {
+        for (std::size_t first = 0; first < numbers_; first += chunk_)
             body(first, std::min(numbers_ - first, chunk_));
-        });
     }
 
     // Adds up what body(first number, count, sums) leaves in the lanes of `kinds` sums.
     template <typename Body>
-    [[nodiscard]] Sums sums(std::size_t kinds, int threads, const Body& body) const {
-        const std::size_t size = kinds * lanes_;
-        std::vector<float> of_chunks(chunks() * size);
-        for_chunks(threads, [&](std::size_t first, std::size_t count) {
-            body(first, count, of_chunks.data() + first / chunk_ * size);
-        });
+    [[nodiscard]] Sums sums(std::size_t kinds, const Body& body) const {
         Sums totals(kinds, std::vector<double>(channels_));
-        for (std::size_t i = 0; i < of_chunks.size(); ++i) {
-            const std::size_t lane = i % size;
-            totals[lane / lanes_][lane % lanes_ % channels_] += of_chunks[i];
-        }
+        std::vector<float> of_chunk(kinds * lanes_);
+        for_chunks([&](std::size_t first, std::size_t count) {
+            std::ranges::fill(of_chunk, 0.0F);
+            body(first, count, of_chunk.data());
+            for (std::size_t i = 0; i < of_chunk.size(); ++i)
+                totals[i / lanes_][i % lanes_ % channels_] += of_chunk[i];
+        });
         return totals;
     }
 
   private:
-    [[nodiscard]] std::size_t chunks() const { return (numbers_ + chunk_ - 1) / chunk_; }
-
     std::size_t channels_;
     std::size_t lanes_;
     std::size_t numbers_;
@@ -152,16 +147,15 @@ TUNGSTEN_DIP_FASTEST void write_gradient(const BFloat16* x, const BFloat16* y, c
 
 }  // namespace
 
-void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale, int threads) {
+void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale) {
     const Traversal traversal(norm);
     const std::size_t lanes = traversal.lanes();
     const auto pixels = static_cast<double>(norm.pixels);
-    const Sums sums = traversal.sums(1, threads, [&](std::size_t first, std::size_t count, float* sum) {
-        add(x + first, count, lanes, sum);
-    });
+    const Sums sums = traversal.sums(
+        1, [&](std::size_t first, std::size_t count, float* sum) { add(x + first, count, lanes, sum); });
     for (std::size_t c = 0; c < norm.channels; ++c) mean[c] = static_cast<float>(sums[0][c] / pixels);
     const std::vector<float> means = traversal.spread([&](std::size_t c) { return mean[c]; });
-    const Sums squares = traversal.sums(1, threads, [&](std::size_t first, std::size_t count, float* sum) {
+    const Sums squares = traversal.sums(1, [&](std::size_t first, std::size_t count, float* sum) {
         add_squares(x + first, count, lanes, means.data(), sum);
     });
     for (std::size_t c = 0; c < norm.channels; ++c) {
@@ -170,7 +164,7 @@ void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, 
     const std::vector<float> factors =
         traversal.spread([&](std::size_t c) { return norm.weight[c] * scale[c]; });
     const std::vector<float> biases = traversal.spread([&](std::size_t c) { return norm.bias[c]; });
-    traversal.for_chunks(threads, [&](std::size_t first, std::size_t count) {
+    traversal.for_chunks([&](std::size_t first, std::size_t count) {
         write_output(x + first, count, lanes, means.data(), factors.data(), biases.data(), norm.slope,
                      y + first);
     });
@@ -178,12 +172,12 @@ void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, 
 
 void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y, const float* mean,
                        const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
-                       float* by_bias, int threads) {
+                       float* by_bias) {
     const Traversal traversal(norm);
     const std::size_t lanes = traversal.lanes();
     const auto pixels = static_cast<double>(norm.pixels);
     const std::vector<float> means = traversal.spread([&](std::size_t c) { return mean[c]; });
-    const Sums sums = traversal.sums(2, threads, [&](std::size_t first, std::size_t count, float* sum) {
+    const Sums sums = traversal.sums(2, [&](std::size_t first, std::size_t count, float* sum) {
         add_gradients(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope, sum,
                       sum + lanes);
     });
@@ -196,7 +190,7 @@ void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y
     const auto constants = traversal.spread([&](std::size_t c) { return -factor(c) * sums[0][c] / pixels; });
     const auto linears = traversal.spread(
         [&](std::size_t c) { return -factor(c) * scale[c] * scale[c] * sums[1][c] / pixels; });
-    traversal.for_chunks(threads, [&](std::size_t first, std::size_t count) {
+    traversal.for_chunks([&](std::size_t first, std::size_t count) {
         write_gradient(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope,
                        factors.data(), constants.data(), linears.data(), by_x + first);
     });

@@ -110,7 +110,7 @@ Bits = npt.NDArray[np.uint16]
 """An image in bfloat16, shape (pixels, channels), as the bits of its numbers."""
 
 def norm_act(
-    x: Bits, weight: FloatArray, bias: FloatArray, epsilon: float, slope: float, threads: int = 0
+    x: Bits, weight: FloatArray, bias: FloatArray, epsilon: float, slope: float
 ) -> tuple[Bits, FloatArray, FloatArray]:
     """Return batch norm and leaky ReLU of an image, and mean and 1 / standard deviation of its channels.
 
@@ -127,6 +127,5 @@ def norm_act_gradient(
     y: Bits,
     mean: FloatArray,
     scale: FloatArray,
-    threads: int = 0,
 ) -> tuple[Bits, FloatArray, FloatArray]:
     """Return the gradients of x, weight and bias, given that of y and what `norm_act` took and returned."""

@@ -56,7 +56,7 @@ struct Example {
                 .epsilon = epsilon,
                 .slope = slope};
     }
-    void run(int threads) { norm_act(norm(), x.data(), y.data(), mean.data(), scale.data(), threads); }
+    void run() { norm_act(norm(), x.data(), y.data(), mean.data(), scale.data()); }
 };
 
 double loss(const Example& example, const std::vector<double>& x, std::vector<double>& y) {
@@ -80,13 +80,13 @@ double loss(const Example& example, const std::vector<double>& x, std::vector<do
 
 void values_and_gradients_are_those_of_the_definition(Size size, int channels) {
     Example example(size, channels);
-    example.run(2);
+    example.run();
     std::vector<BFloat16> by_x(example.x.size());
     std::vector<float> by_weight(example.channels);
     std::vector<float> by_bias(example.channels);
     norm_act_gradient(example.norm(), example.x.data(), example.y.data(), example.mean.data(),
                       example.scale.data(), example.gradient.data(), by_x.data(), by_weight.data(),
-                      by_bias.data(), 2);
+                      by_bias.data());
 
     std::vector<double> x(example.x.size());
     std::ranges::transform(example.x, x.begin(), value_of);
@@ -114,16 +114,6 @@ void values_and_gradients_are_those_of_the_definition(Size size, int channels) {
     }
 }
 
-void threads_make_no_difference() {
-    Example one({.height = 90, .width = 101}, 8);  // several chunks
-    Example many = one;
-    one.run(1);
-    many.run(5);
-    CHECK(one.y == many.y);
-    CHECK(one.mean == many.mean);
-    CHECK(one.scale == many.scale);
-}
-
 }  // namespace
 
 int main() {
@@ -131,6 +121,5 @@ int main() {
     values_and_gradients_are_those_of_the_definition({.height = 5, .width = 7}, 3);
     values_and_gradients_are_those_of_the_definition({.height = 6, .width = 4}, 8);
     values_and_gradients_are_those_of_the_definition({.height = 3, .width = 3}, 70);
-    threads_make_no_difference();
     return failed_checks();
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
+from threading import Event, main_thread
 from typing import Any, Literal
 
 import numpy as np
@@ -390,7 +390,7 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
     def after_training(*arguments: Any) -> tuple[FloatImage, ...]:
         assert trained.wait(timeout=60)
         # Python raises it in the main thread, which waits for this one.
-        signal.raise_signal(signal.SIGINT)
+        signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
         assert arguments[-1].wait(timeout=60)
         return pilots_of_all_samples(*arguments)
 

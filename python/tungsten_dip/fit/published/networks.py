@@ -31,6 +31,9 @@ from tungsten_dip.fit.published.constants import (
 Pointwise = Callable[[Tensor], Tensor]
 """A function that treats every pixel alike and by itself."""
 
+_FEW_THREADS = 4
+"""Up to so many threads together take longer for a norm than the core takes on one."""
+
 
 class Skip(nn.Module):
     """Encoder and decoder with connections across at the coarse scales.
@@ -124,7 +127,7 @@ class _NormAct(_Norm):
     """Batch norm, then leaky ReLU in place."""
 
     def forward(self, x: Tensor) -> Tensor:
-        if x.device.type == "cpu" and x.dtype == torch.bfloat16:
+        if x.dtype == torch.bfloat16 and x.device.type == "cpu" and torch.get_num_threads() <= _FEW_THREADS:
             return cast(Tensor, _NormActOnCpu.apply(x, self.weight, self.bias))  # type: ignore[no-untyped-call]
         return F.leaky_relu_(super().forward(x), LEAKY_SLOPE)
 
@@ -137,9 +140,8 @@ class _NormActOnCpu(torch.autograd.Function):
         """Take (batch, channels, height, width) and two vectors of channels."""
         ctx.shape = x.permute(0, 2, 3, 1).shape
         norm = _bits(x), weight.detach().numpy(), bias.detach().numpy(), NORM_EPSILON, LEAKY_SLOPE
-        threads = torch.get_num_threads()
-        y, mean, scale = _core.norm_act(*norm, threads)
-        ctx.kept = *norm, y, mean, scale, threads
+        y, mean, scale = _core.norm_act(*norm)
+        ctx.kept = *norm, y, mean, scale
         return _image(y, ctx.shape)
 
     @staticmethod
