@@ -147,7 +147,7 @@ def test_what_frames_were_taken_for_is_told_once(frames, capsys, more):
         "color: mean color.RGB, half_a colorA.RGB, half_b colorB.RGB, variance colorVariance.RGB",
         "normal: mean normal.RGB, half_a normalA.RGB, half_b normalB.RGB, variance normalVariance.RGB",
         "normal: mean normal.RGB, half_a normalA.RGB, variance normalVariance.RGB",
-        "mended color 3 NaN",
+        "repaired color 3 NaN",
     ):
         assert lines.count(told) == 1, told
     assert sum(line.startswith("frame ") for line in lines) == COUNT
