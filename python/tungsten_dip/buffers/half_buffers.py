@@ -20,7 +20,7 @@ _ROUNDED = 2e-3
 _FOREIGN_SHARE = 0.05
 """Part of the pixels that may lie further away. In renders it is below 0.01."""
 
-_ENOUGH_PIXELS = 1 << 16
+_ENOUGH_PIXELS = 1 << 14
 
 
 def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
