@@ -24,7 +24,7 @@ from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
 """Formats that hold linear radiance, in the order of preference."""
@@ -236,7 +236,7 @@ def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
                 OpenEXR.File({name: value, "type": OpenEXR.scanlineimage}, pixel).write(io.BytesIO())
             kept[name] = value
         except (RuntimeError, TypeError, ValueError) as error:
-            log.warning("attribute %s is left out: %s", name, _one_line(str(error)))
+            _LOG.warning("attribute %s is left out: %s", name, _one_line(str(error)))
     return kept
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tungsten_dip.sequence.frames import Frame
     from tungsten_dip.sequence.work import Record
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 
 _TOLD_OF_EVERY_FRAME = tuple(
@@ -161,11 +161,11 @@ def _without_repetition() -> Iterator[None]:
 
 def _tell(record: Record) -> None:
     if record.skipped:
-        log.info("frame %d: finished already: %s", record.number, record.output)
+        _LOG.info("frame %d: finished already: %s", record.number, record.output)
     elif record.error is not None:
-        log.error("frame %d: %s", record.number, record.error)
+        _LOG.error("frame %d: %s", record.number, record.error)
     else:
-        log.info(
+        _LOG.info(
             "frame %d: %s, %d steps, %.1f s: %s",
             record.number, record.how, record.iterations, record.seconds, record.output,
         )  # fmt: skip
@@ -183,7 +183,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
             raise InputError(
                 f"{path}: not written: frame {first.number} was finished before; remove its result"
             )
-        log.info("%s: left as it is: frame %d was finished before", path, first.number)
+        _LOG.info("%s: left as it is: frame %d was finished before", path, first.number)
         return
     if models.first is None:
         raise InputError(f"{path}: not written: no network was fitted, as the frames have no noise")

@@ -35,7 +35,7 @@ from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import Camera, PinholeCamera, Scene, ThinlensCamera
 
-log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 Denoise = Callable[[Camera, RenderBuffers], FitResult]
 """Denoises the render of a camera."""
@@ -68,10 +68,10 @@ def write_outputs(
     if report is not None:
         write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
     for written in filter(None, (exr, png, pair, report)):
-        log.info("wrote %s", written)
+        _LOG.info("wrote %s", written)
     if save_model is not None:
         write_model(save_model, result)
-        log.info("wrote %s", save_model)
+        _LOG.info("wrote %s", save_model)
     if result.interrupted:
         raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
 
@@ -95,7 +95,7 @@ def _run(arguments: Sequence[str] | None) -> None:
     host = options.host
     if host == "auto":
         host = "tungsten" if tungsten_host.available() else "mitsuba"
-    log.info("rendering with %s", host.capitalize())
+    _LOG.info("rendering with %s", host.capitalize())
     if host == "mitsuba" and (options.checkpoint or options.dip_preview):
         raise InputError(
             "Mitsuba saves no checkpoints for --checkpoint and --dip-preview; add --host tungsten"
@@ -126,7 +126,7 @@ def _run(arguments: Sequence[str] | None) -> None:
             if len(options.scenes) == 1:
                 raise
             failed += 1
-            log.error("%s", error)
+            _LOG.error("%s", error)
     if failed:
         raise InputError(f"{failed} of {len(options.scenes)} scenes failed, see above")
 
@@ -195,7 +195,7 @@ def _render_scene(
                 buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
         write_render(buffers, unwritten, scene.camera.tonemap)
         for written in filter(None, (outputs.ldr, outputs.hdr)):
-            log.info("wrote %s", written)
+            _LOG.info("wrote %s", written)
         if denoise is not None:
             result = denoise(scene.camera, buffers)
             tonemap = scene.camera.tonemap
@@ -276,7 +276,7 @@ def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoi
     def denoise(camera: Camera, buffers: RenderBuffers) -> FitResult:
         known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
         if known is None:
-            log.info("a camera of type %s moves no frame into place", camera.kind)
+            _LOG.info("a camera of type %s moves no frame into place", camera.kind)
         with progress_on_stderr("denoising") as progress:
             return follower.denoise(buffers, known, progress).result
 
@@ -292,7 +292,7 @@ def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten
     def write(rendered: tungsten_host.Rendered) -> None:
         result = denoise_with_progress(rendered.buffers, draft)
         write_image(path, display_from_radiance(result.color, rendered.tonemap))
-        log.info("wrote %s", path)
+        _LOG.info("wrote %s", path)
         if result.interrupted:
             raise KeyboardInterrupt  # which was meant for the render
 
@@ -318,7 +318,7 @@ def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Pr
     from tungsten_dip.hosts.mitsuba.render import render  # imports Mitsuba
 
     if scene.renderer.enable_resume_render:
-        log.warning("%s: asks to resume; Mitsuba saves no state and starts from 0 spp", scene.path)
+        _LOG.warning("%s: asks to resume; Mitsuba saves no state and starts from 0 spp", scene.path)
     wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}
     if options.dip_denoise:
         wanted |= set(decision_of(scene).buffers)

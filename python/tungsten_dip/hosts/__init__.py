@@ -13,7 +13,7 @@ from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 _RENDERING = threading.Lock()
 """Both hosts keep some of their state in globals of the process."""
@@ -45,7 +45,7 @@ def render(
     if host == "auto":
         host = "tungsten" if tungsten.available() else "mitsuba"
     path, folder = (scene.path, scene.input_directory) if isinstance(scene, Scene) else (scene, None)
-    _log.info("%s: rendered by %s", path, host.capitalize())
+    _LOG.info("%s: rendered by %s", path, host.capitalize())
     with _RENDERING:
         if host == "tungsten":
             # Which may know more than `load_scene`.

@@ -30,7 +30,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.progress import Progress, silent
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 BUILD_HINT = "build the package with Tungsten_ROOT set to a Tungsten checkout (docs/tungsten.md)"
 
@@ -168,7 +168,7 @@ def drive(
                 on_checkpoint(rendered(session.evidence()))
             except Exception as error:
                 failure = error
-                _log.warning("the preview failed, the render goes on without: %s", error)
+                _LOG.warning("the preview failed, the render goes on without: %s", error)
 
     try:
         interrupted = _render_passes(session, Path(scene_path), options, checkpoint, progress)
@@ -292,7 +292,7 @@ def _render_passes(
     """Render until done or out of time; return whether Ctrl-C ended it early."""
     plan = session.plan
     if not plan.writes_features:
-        _log.info("%s: the integrator %s writes no feature buffers: colour alone", scene, plan.integrator)
+        _LOG.info("%s: the integrator %s writes no feature buffers: colour alone", scene, plan.integrator)
     if checkpoint is not None and plan.resume and not options.restart:
         _resume(session, scene)
     interval_s = options.checkpoint_interval_s
@@ -312,7 +312,7 @@ def _render_passes(
             return True
         now = time.monotonic()
         if timeout_s > 0 and now - start > timeout_s:
-            _log.info("%s: out of time after %d of %d spp", scene, session.current_spp, total)
+            _LOG.info("%s: out of time after %d of %d spp", scene, session.current_spp, total)
             break
         if checkpoint is not None and interval_s > 0 and now - last_checkpoint > interval_s:
             checkpoint()
@@ -328,9 +328,9 @@ def _resume(session: Any, scene: Path) -> None:
         message = f"{scene}: its saved state cannot be read: {error}; delete it, or render with --restart"
         raise InputError(" ".join(message.split())) from None
     if resumed:
-        _log.info("resuming at %d spp", session.current_spp)
+        _LOG.info("resuming at %d spp", session.current_spp)
     else:
-        _log.info("no saved state of this scene with evidence: starting at 0 spp")
+        _LOG.info("no saved state of this scene with evidence: starting at 0 spp")
 
 
 @contextmanager
@@ -345,7 +345,7 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         nonlocal requested
         requested = True
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        _log.warning("stopping after this pass; Ctrl-C again stops at once and saves nothing")
+        _LOG.warning("stopping after this pass; Ctrl-C again stops at once and saves nothing")
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
@@ -362,7 +362,7 @@ def _buffers(plan: Any, evidence: Evidence) -> RenderBuffers:
     planes = {name: dict(evidence[name]) for name in CHANNELS if name in evidence}
     if np.max(spp) < 2 and plan.writes_features:
         # The second half is empty and the variance is zero: neither says anything.
-        _log.warning("1 sample per pixel has no halves and no variance; render at least 2")
+        _LOG.warning("1 sample per pixel has no halves and no variance; render at least 2")
         planes = {name: {"mean": known["mean"]} for name, known in planes.items()}
     attributes = {
         "renderer": f"Tungsten {_require_module().tungsten_version}",
@@ -380,7 +380,7 @@ def _module() -> Any | None:
     except ModuleNotFoundError:
         return None
     except ImportError as error:
-        _log.warning("the hook for Tungsten cannot be loaded: %s", error)
+        _LOG.warning("the hook for Tungsten cannot be loaded: %s", error)
         return None
 
 

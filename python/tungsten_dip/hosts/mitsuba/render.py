@@ -24,7 +24,7 @@ from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.types import Scene
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 QUANTITIES = ("color", "albedo", "normal", "depth")
 """What is rendered unless something else is asked for; colour is always there."""
@@ -60,7 +60,7 @@ def render(
     into memory, or an argument is out of range, and KeyboardInterrupt within a moment of Ctrl-C.
     """
     if scene.renderer.adaptive_sampling or scene.renderer.stratified_sampler:
-        _log.info(
+        _LOG.info(
             "adaptive_sampling and stratified_sampler rest: every pixel gets as many independent samples"
         )
     _check_quantities(quantities)
@@ -114,7 +114,7 @@ def render_translated(
         statistics: dict[str, _Statistics] = {}
         while done_spp < spp:
             if done_spp and timeout_s is not None and time.perf_counter() - started > timeout_s:
-                _log.info("out of time after %d of %d spp", done_spp, spp)
+                _LOG.info("out of time after %d of %d spp", done_spp, spp)
                 break
             pass_spp = min(spp - done_spp, spp if timeout_s is None else spp_step)
             pass_seed = int(np.random.SeedSequence([seed, done_spp]).generate_state(1)[0])
@@ -123,9 +123,9 @@ def render_translated(
             for name, rendered in _statistics(pixels, quantities).items():
                 statistics[name] = statistics[name].merged(rendered) if name in statistics else rendered
             done_spp += pass_spp
-    _log.info("Mitsuba %s rendered %d spp in %.1f s", VERSION, done_spp, time.perf_counter() - started)
+    _LOG.info("Mitsuba %s rendered %d spp in %.1f s", VERSION, done_spp, time.perf_counter() - started)
     if done_spp == 1:
-        _log.warning("1 sample per pixel has no halves and no variance; render at least 2")
+        _LOG.warning("1 sample per pixel has no halves and no variance; render at least 2")
     buffers = {name: known.buffer(has_halves=done_spp > 1) for name, known in statistics.items()}
     return RenderBuffers(
         color=buffers.pop("color"),

@@ -15,7 +15,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.interrupts import held_interrupts
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 VARIANT = "scalar_rgb"
 """The variant that our plugins are compiled for: it needs no LLVM and gives the same bits everywhere."""
@@ -75,7 +75,7 @@ def _log_appender(mitsuba: Any) -> Any:
 
         def append(self, level: Any, text: str) -> None:
             is_warning = level >= mitsuba.LogLevel.Warn
-            _log.log(logging.WARNING if is_warning else logging.DEBUG, "%s", text)
+            _LOG.log(logging.WARNING if is_warning else logging.DEBUG, "%s", text)
 
         def log_progress(self, *_: object) -> None:
             """Progress is polled from the integrator instead."""

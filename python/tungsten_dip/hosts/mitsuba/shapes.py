@@ -27,7 +27,7 @@ from tungsten_dip.scene.types import Matrix
 
 _Array = npt.NDArray[np.float64]
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 # From Mitsuba's UV to Tungsten's.
 _DISK_UV = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -238,7 +238,7 @@ def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
         if isinstance(master, ts.Instances):
             raise t.unsupported("instances within instances")
         if not isinstance(master, ts.Quad | ts.Disk):
-            _log.warning(
+            _LOG.warning(
                 "%s: %s: Tungsten lights instances of a %s from the wrong places; here they are right",
                 t.source.path,
                 t.place,

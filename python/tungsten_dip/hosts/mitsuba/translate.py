@@ -21,7 +21,7 @@ from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.hosts.mitsuba.translation import Translation, load
 from tungsten_dip.scene import types as ts
 
-_log = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 
 def translate(scene: ts.Scene) -> TranslatedScene:
@@ -78,7 +78,7 @@ def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
         return integrator
     if isinstance(integrator, ts.LightTracer):
         raise t.unsupported("a light_tracer, which shows no mirrors,")
-    _log.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
+    _LOG.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
     kept = {}
     if isinstance(integrator, ts.PathTracer | ts.PhotonMap):
         kept = {name: getattr(integrator, name) for name in ("low_order_scattering", "include_surfaces")}
