@@ -32,7 +32,7 @@ Pointwise = Callable[[Tensor], Tensor]
 """A function that treats every pixel alike and by itself."""
 
 _FEW_THREADS = 4
-"""Up to so many threads together take longer for a norm than the core takes on one."""
+"""Up to here the core, on one thread, is taken to be faster than PyTorch on all; measured with 1 and 2."""
 
 
 class Skip(nn.Module):
