@@ -388,7 +388,7 @@ def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest
         read_buffers(tmp_path, {"color": "missing.exr"})
 
 
-def test_a_scene_names_its_buffers(tmp_path: Path) -> None:
+def test_a_scene_names_its_buffers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "out").mkdir()
     for name in ("c", "cA", "cB", "cVariance", "n", "nVariance"):
         save(tmp_path / "out" / f"{name}.exr", *"RGB")
@@ -419,6 +419,11 @@ def test_a_scene_names_its_buffers(tmp_path: Path) -> None:
     (tmp_path / "out" / "cB.exr").unlink()
     with pytest.raises(InputError, match=r"cB.exr, which does not exist; render the scene first"):
         read_buffers(path)
+    for name in ("cA", "cVariance"):
+        (tmp_path / "out" / f"{name}.exr").unlink()
+    with caplog.at_level(logging.INFO):
+        assert [name for name, _ in read_buffers(path).color.planes()] == ["mean"]
+    assert "color: no cA.exr, cB.exr, cVariance.exr" in caplog.text
 
 
 def test_a_scene_may_hold_comments_and_trailing_commas(tmp_path: Path) -> None:

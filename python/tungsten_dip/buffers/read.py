@@ -160,6 +160,11 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
             f'{path}: saves no colour; add {{"type": "color", "hdr_output_file": "color.exr"}} to '
             "renderer.output_buffers and render"
         )
+    for quantity in CHANNELS:
+        noise = [key for suffix in _SUFFIXES[1:] if (key := quantity + suffix) in files]
+        if noise and not any(files[key].is_file() for key in noise):
+            # A render of 1 spp has no halves. If some of these files are missing, it was cut short.
+            ignored.append(f"{quantity}: no {', '.join(files.pop(key).name for key in noise)}")
     missing = [file for file in files.values() if not file.is_file()]
     if missing:
         raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")
