@@ -13,6 +13,7 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender, relmse
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, write_denoised
+from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
@@ -689,6 +690,15 @@ def test_halves_of_another_picture_are_left_aside(spoil: str, black: float, rend
     _check(result, buffers)
     assert any("color: the half buffers are not used" in note for note in result.notes)
     assert result.color.mean() == pytest.approx(mean.mean(), rel=0.05)
+
+
+def test_halves_of_another_picture_are_found_wherever_they_show() -> None:
+    """In a picture of many pixels, of which only some are looked at: not a single column, say."""
+    a, b, mean = (np.zeros((1 << 14, 8, 3), np.float32) for _ in range(3))
+    mean[:, 5:] = 1
+    _, lines = without_foreign_halves(RenderBuffers(Buffer(mean, a, b)))
+    assert len(lines) == 1
+    assert without_foreign_halves(RenderBuffers(Buffer(mean, mean, mean)))[1] == ()
 
 
 def test_halves_of_another_feature_are_left_aside(render: SyntheticRender) -> None:

@@ -62,9 +62,12 @@ def _halves_belong(buffer: Buffer) -> bool:
     """
     if buffer.halves is None:
         return True
-    step = -(-buffer.mean[:, :, 0].size // _ENOUGH_PIXELS)
+    count = buffer.mean[:, :, 0].size
+    pixels = np.arange(count)
+    if count > _ENOUGH_PIXELS:
+        pixels = np.random.default_rng(0).integers(count, size=_ENOUGH_PIXELS)
     mean, a, b = (
-        image.reshape(-1, image.shape[2])[::step].astype(np.float64)
+        image.reshape(-1, image.shape[2])[pixels].astype(np.float64)
         for image in (buffer.mean, *buffer.halves)
     )
     with np.errstate(invalid="ignore"):
