@@ -170,8 +170,8 @@ class PointwiseNetwork:
 
 
 def members_of(weights: Weights) -> int:
-    """Return how many members have these weights."""
-    return len(weights["layer1.bias"]) // HIDDEN
+    """Return how many members have these weights, at least 1 also for weights that are no network's."""
+    return max(np.size(weights.get("layer1.bias", ())) // HIDDEN, 1)
 
 
 def _forward(planes: int, choices: int) -> onnx.ModelProto:

@@ -16,7 +16,7 @@ from onnx import TensorProto
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.planes import LARGEST_INPUT
-from tungsten_dip.fit.pointwise import HIDDEN
+from tungsten_dip.fit.pointwise import HIDDEN, members_of
 from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
 from tungsten_dip.fit.published.constants import (
     LEAKY_SLOPE,
@@ -81,8 +81,7 @@ class _Network(GraphBuilder):
         centred = self.add("Cast", centred, to=TensorProto.FLOAT)
         x = self.add("Div", centred, self.constant("std", std.reshape(-1, 1, 1)))
         x = self.add("Clip", x, self.number(-LARGEST_INPUT), self.number(LARGEST_INPUT))
-        bias = self._weights.get("layer1.bias")
-        members = 1 if bias is None else max(bias.size // HIDDEN, 1)
+        members = members_of(self._weights)
         if members > _MOST_MEMBERS:
             raise InputError(f"the model has {members} members: expected at most {_MOST_MEMBERS}")
         hidden = members * HIDDEN
