@@ -93,8 +93,9 @@ def test_gradients_are_those_of_the_values(network):
 
 
 @pytest.mark.parametrize("shape", [(1, 8, 80, 130), (2, 3, 7, 5), (1, 1, 1, 2), (1, 130, 5, 6)])
-def test_the_norm_in_bfloat16_is_pytorchs_batch_norm(shape):
+def test_the_norm_in_bfloat16_is_pytorchs_batch_norm(shape, monkeypatch):
     """But for the rounding of what comes in and out: sums are in float32 at least."""
+    monkeypatch.setattr(networks, "_FEW_THREADS", torch.get_num_threads())
 
     def normed(norm, image):
         x = image.clone().requires_grad_()
