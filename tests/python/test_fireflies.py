@@ -23,59 +23,61 @@ def _halves(height: int = 24, width: int = 31) -> tuple[FloatImage, FloatImage]:
 def test_a_firefly_of_one_half_is_limited(half: int, radiance: float, at: tuple[int, int]) -> None:
     halves = _halves()
     halves[half][at] = radiance * np.array([1, 0.5, 0.25], np.float32)
-    limited, note = limit_fireflies(*halves, 1)
-    assert note is not None
-    assert note.startswith("1 firefly limited")
+    limited = limit_fireflies(*halves, 1)
+    assert limited.note is not None
+    assert limited.note.startswith("1 firefly limited")
     # 15 times what is around it, give or take the noise of that.
-    level = limited[half][at].mean()
+    level = limited.halves[half][at].mean()
     assert 5 < level < 30
-    np.testing.assert_allclose(limited[half][at] / limited[half][at][0], [1, 0.5, 0.25], rtol=1e-5)
+    np.testing.assert_allclose(
+        limited.halves[half][at] / limited.halves[half][at][0], [1, 0.5, 0.25], rtol=1e-5
+    )
     others = np.ones(halves[0].shape[:2], bool)
     others[at] = False
-    np.testing.assert_array_equal(limited[half][others], halves[half][others])
-    np.testing.assert_array_equal(limited[1 - half], halves[1 - half])
+    np.testing.assert_array_equal(limited.halves[half][others], halves[half][others])
+    np.testing.assert_array_equal(limited.halves[1 - half], halves[1 - half])
 
 
 def test_fireflies_side_by_side_do_not_support_one_another() -> None:
     halves = _halves()
     for at, radiance in (((10, 10), 1e5), ((10, 11), 1e8), ((11, 12), 1e20)):
         halves[0][at] = radiance
-    limited, note = limit_fireflies(*halves, 2)
-    assert note is not None
-    assert limited[0].max() < 200
+    limited = limit_fireflies(*halves, 2)
+    assert limited.note is not None
+    assert limited.halves[0].max() < 200
 
 
 @pytest.mark.parametrize("radiance", [1e3, 1e8, 1e30])
 def test_a_light_that_both_halves_show_is_left_alone(radiance: float) -> None:
     halves = _halves()
     halves[0][5, 6], halves[1][5, 6] = radiance, 0.8 * radiance
-    limited, note = limit_fireflies(*halves, 1)
-    assert note is None
-    for before, after in zip(halves, limited, strict=True):
+    limited = limit_fireflies(*halves, 1)
+    assert limited.note is None
+    for before, after in zip(halves, limited.halves, strict=True):
         np.testing.assert_array_equal(before, after)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 5), (24, 31)])
 def test_images_without_fireflies_keep_every_bit(size: tuple[int, int]) -> None:
     for halves in (_halves(*size), (np.zeros((*size, 3), np.float32),) * 2):
-        limited, note = limit_fireflies(*halves, 1)
-        assert note is None
-        for before, after in zip(halves, limited, strict=True):
+        limited = limit_fireflies(*halves, 1)
+        assert limited.note is None
+        for before, after in zip(halves, limited.halves, strict=True):
             assert before.tobytes() == after.tobytes()
 
 
 def test_a_lone_pixel_is_bounded_by_the_other_half() -> None:
     dim, bright = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 1e9, np.float32)
-    limited, note = limit_fireflies(dim, bright, 1)
-    assert note is not None
-    np.testing.assert_array_equal(limited[0], dim)
-    np.testing.assert_allclose(limited[1], 2, rtol=1e-5)
+    limited = limit_fireflies(dim, bright, 1)
+    assert limited.note is not None
+    np.testing.assert_array_equal(limited.halves[0], dim)
+    np.testing.assert_allclose(limited.halves[1], 2, rtol=1e-5)
 
 
 def test_a_firefly_before_black_stays_finite() -> None:
     halves = np.zeros((9, 9, 3), np.float32), np.zeros((9, 9, 3), np.float32)
     halves[0][4, 4] = 1e30
-    limited, _ = limit_fireflies(*halves, 1)
+    limited = limit_fireflies(*halves, 1).halves
     assert all(np.isfinite(half).all() for half in limited)
     assert limited[0].max() < 1e30
     assert limited[0].min() == 0
@@ -84,6 +86,42 @@ def test_a_firefly_before_black_stays_finite() -> None:
 def test_limits_scale_with_the_exposure() -> None:
     halves = _halves()
     halves[0][3, 4] = 1e7
-    scaled, _ = limit_fireflies(*(half * np.float32(2**-6) for half in halves), 1)
-    for plain, small in zip(limit_fireflies(*halves, 1)[0], scaled, strict=True):
+    scaled = limit_fireflies(*(half * np.float32(2**-6) for half in halves), 1).halves
+    for plain, small in zip(limit_fireflies(*halves, 1).halves, scaled, strict=True):
         np.testing.assert_array_equal(plain * np.float32(2**-6), small)
+
+
+def test_what_is_certain_of_the_removed_radiance_is_given_back() -> None:
+    rng = np.random.default_rng(1)
+    halves = _halves(200, 300)
+    struck = rng.random((200, 300)) < 0.004
+    halves[0][struck] = 40
+    limited = limit_fireflies(*halves, 2)
+    assert limited.gain is not None
+    given_back = (sum(limited.halves) / 2 * limited.gain).mean()
+    removed = (sum(halves) - sum(limited.halves)).mean() / 2
+    left = (sum(halves) / 2).mean() - given_back
+    # Windows hold 20 to 90 fireflies: three standard errors are 0.3 to 0.7 of their sum.
+    assert 0.3 * removed < left < 0.7 * removed
+
+
+@pytest.mark.parametrize("radiance", [1e2, 1e6, 1e30])
+def test_a_single_firefly_gives_nothing_back(radiance: float) -> None:
+    halves = _halves(60, 90)
+    halves[0][30, 40] = radiance
+    limited = limit_fireflies(*halves, 1)
+    assert limited.gain is not None
+    assert limited.gain.max() == 1
+
+
+def test_one_huge_firefly_among_many_does_not_brighten_the_image() -> None:
+    rng = np.random.default_rng(1)
+    gains = []
+    for radiance in (40, 1e9):
+        halves = _halves(200, 300)
+        halves[0][rng.random((200, 300)) < 0.004] = 40
+        halves[0][100, 150] = radiance
+        gain = limit_fireflies(*halves, 2).gain
+        assert gain is not None
+        gains.append(gain.mean() - 1)
+    assert gains[1] < 1.1 * gains[0]

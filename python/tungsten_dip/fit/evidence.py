@@ -15,7 +15,7 @@ from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Ren
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit.fireflies import Limited, limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
@@ -96,7 +96,7 @@ class Evidence:
     (height, width). ``pilots`` holds both halves of every pilot, the noisy halves themselves first.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and the
     other half, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
-    `Guides`).
+    `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`).
     """
 
     scale: float
@@ -106,6 +106,7 @@ class Evidence:
     pilots: tuple[Halves, ...]
     noises: Halves
     guide_noise: FloatImage
+    gain: FloatImage | None
     notes: tuple[str, ...]
     threads: int
 
@@ -138,6 +139,7 @@ class Evidence:
             pilots=tuple(cut(pilot) for pilot in self.pilots),
             noises=cut(self.noises),
             guide_noise=self.guide_noise[first:end],
+            gain=None if self.gain is None else self.gain[first:end],
         )
 
 
@@ -163,7 +165,8 @@ def evidence_from_buffers(
     """
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
-    mean, halves, fireflies = _without_fireflies(buffers.color, scale, threads)
+    mean, limited = _without_fireflies(buffers.color, scale, threads)
+    halves = limited.halves
     guidance = guidance_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
     handed_in = [_scaled_halves(pair, scale) for pair in candidates]
@@ -187,8 +190,10 @@ def evidence_from_buffers(
     if layout is None:
         layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(handed_in), reference)
     features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
-    notes = (*_notes_on_features(buffers), *fireflies)
-    return Evidence(scale, mean, features, layout, images, noises, guides.noise, notes, threads)
+    notes = _notes_on_features(buffers)
+    if limited.note is not None:
+        notes = (*notes, limited.note)
+    return Evidence(scale, mean, features, layout, images, noises, guides.noise, limited.gain, notes, threads)
 
 
 def _guides(
@@ -224,16 +229,14 @@ def _computed(
     return computed
 
 
-def _without_fireflies(
-    color: Buffer, scale: float, threads: int
-) -> tuple[FloatImage, Halves, tuple[str, ...]]:
-    """Return the mean and the halves, scaled, and a note on fireflies, if there are any."""
+def _without_fireflies(color: Buffer, scale: float, threads: int) -> tuple[FloatImage, Limited]:
+    """Return the mean and the halves, scaled, without fireflies."""
     assert color.halves is not None
     half_a, half_b = color.halves
-    halves, note = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
-    if note is None:
-        return scaled(color.mean, scale), halves, ()
-    return np.float32(0.5) * (halves[0] + halves[1]), halves, (note,)
+    limited = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
+    if limited.gain is None:
+        return scaled(color.mean, scale), limited
+    return np.float32(0.5) * (limited.halves[0] + limited.halves[1]), limited
 
 
 def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:

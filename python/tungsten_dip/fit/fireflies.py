@@ -1,9 +1,16 @@
-"""Fireflies: single samples so bright that no filter can spread them without leaving a blot."""
+"""Fireflies: single samples so bright that no filter can spread them without leaving a blot.
+
+Their radiance is limited. What this removes is given back evenly, as far as it is statistically certain.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip import _core
 from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.neighbours import mean_around
 
@@ -23,24 +30,48 @@ _SETTLED = 0.9
 _BRIGHTEST = 1e30
 """Sums of brighter pixels overflow."""
 
+_MOST_RETURNED = 60.0
+"""No firefly gives back more than so many times the radiance around it: few hold most of what is removed."""
 
-def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> tuple[Halves, str | None]:
+_SURELY = 3.0
+"""So many standard errors are subtracted from what is given back."""
+
+
+@dataclass(frozen=True)
+class Limited:
+    """Both halves with their fireflies limited, linear radiance of shape (height, width, 3).
+
+    ``gain``, shape (height, width, 1), at least 1, times the denoised image gives back what is certain of the
+    radiance removed. ``note`` is a line on that radiance. Both are None without fireflies.
+    """
+
+    halves: Halves
+    gain: FloatImage | None = None
+    note: str | None = None
+
+
+def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> Limited:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
     What is about equal in both halves is left alone, whatever its radiance, and so is everything up to 15
-    times the mean of the 17x17 pixels around it. Returns both halves and a note on the radiance that was
-    removed, if any.
+    times the mean of the 17x17 pixels around it.
     """
     levels = [_level(half) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)
     limits = [np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other) for other in levels[::-1]]
-    (a, taken_a), (b, taken_b) = (
-        _limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True)
-    )
-    return (a, b), _note(np.concatenate((taken_a, taken_b)), float(levels[0].sum() + levels[1].sum()))
+    taken = [np.maximum(level - limit, 0) for level, limit in zip(levels, limits, strict=True)]
+    count = sum(int(np.count_nonzero(t)) for t in taken)
+    if count == 0:
+        return Limited((half_a, half_b))
+    a, b = (_limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True))
+    share = float(taken[0].sum() + taken[1].sum()) / float(levels[0].sum() + levels[1].sum())
+    noun = "firefly" if count == 1 else "fireflies"
+    note = f"{count} {noun} limited, with {100 * share:.3g}% of the image's energy"
+    kept = (levels[0] - taken[0] + levels[1] - taken[1]) / 2
+    return Limited((a, b), _gain(taken, kept, around, threads), note)
 
 
-_Levels = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+_Levels = npt.NDArray[np.float64]
 
 
 def _level(image: FloatImage) -> _Levels:
@@ -48,19 +79,40 @@ def _level(image: FloatImage) -> _Levels:
     return level
 
 
-def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> tuple[FloatImage, _Levels]:
-    """Return the image, no brighter than the limit, and what every pixel that was brighter has lost."""
+def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> FloatImage:
+    """Return the image, no brighter than the limit."""
     over = level > limit
     factor = np.where(over, limit / np.where(over, level, 1), 1)
     limited: FloatImage = image * factor.astype(np.float32)
-    return limited, (level - limit)[over]
+    return limited
 
 
-def _note(taken: _Levels, total: float) -> str | None:
-    if taken.size == 0:
-        return None
-    noun = "firefly" if taken.size == 1 else "fireflies"
-    return f"{taken.size} {noun} limited, with {100 * taken.sum() / total:.3g}% of the image's energy"
+def _gain(taken: list[_Levels], kept: _Levels, around: FloatImage, threads: int) -> FloatImage:
+    """Return 1 plus the certain part of what was ``taken`` from the halves, relative to what was ``kept``.
+
+    Both are means over a window of half the image's longer side. Fireflies strike independently of one
+    another, so that the variance of their sum is the sum of their squares.
+    """
+    height, width = kept.shape[:2]
+    radius = max(height, width) // 4
+    unit = float(around.max()) or 1.0
+    parts = [np.minimum(t, _MOST_RETURNED * around) / unit for t in taken]
+
+    def mean(values: _Levels) -> _Levels:
+        return np.maximum(_core.box_mean(values.astype(np.float32), radius, threads), 0).astype(np.float64)
+
+    pixels = _extents(height, radius)[:, None, None] * _extents(width, radius)[:, None]
+    returned = mean((parts[0] + parts[1]) / 2)
+    error = np.sqrt(mean((parts[0] ** 2 + parts[1] ** 2) / 4) / pixels)
+    certain = np.maximum(returned - _SURELY * error, 0)
+    gain: FloatImage = (1 + certain / np.maximum(mean(kept / unit), 1e-30)).astype(np.float32)
+    return gain
+
+
+def _extents(size: int, radius: int) -> npt.NDArray[np.int64]:
+    """Return how many pixels of a row of ``size`` pixels the window around each of them covers."""
+    at = np.arange(size)
+    return np.minimum(at + radius + 1, size) - np.maximum(at - radius, 0)
 
 
 def _surroundings(level: _Levels, threads: int) -> FloatImage:

@@ -175,6 +175,8 @@ def result_from_fused(
         image, fused = evidence.mean, evidence.halves
         epsilon = _epsilon_of_renderer(evidence.scale)
         error = _relative(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
+    if evidence.gain is not None:
+        image = image * evidence.gain
     return FitResult(
         color=unscaled(image, evidence.scale),
         settings=settings,
