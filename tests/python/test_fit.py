@@ -378,6 +378,28 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
     assert result.interrupted
 
 
+def test_strands_before_nothing_are_found_by_alpha() -> None:
+    """Without features, all that tells thin strands from noise is their coverage."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[0:72, 0:112].astype(np.float32)
+    alpha = np.zeros((72, 112, 1), np.float32)
+    for strand in range(24):
+        at = rng.uniform(-20, 132) + rng.uniform(-0.5, 0.5) * rows + 4 * np.sin(rows / 12 + strand)
+        alpha[..., 0] = np.maximum(alpha[..., 0], np.clip(1.2 - np.abs(columns - at), 0, 1))
+    truth = alpha * np.array([0.6, 0.4, 0.25], np.float32)
+    noisy = Buffer((truth * rng.gamma(10, 0.1, alpha.shape)).astype(np.float32))
+    draft = FitSettings(preset="draft")
+    result = denoise(RenderBuffers(noisy, alpha=alpha), draft)
+    assert relmse(result.color, truth) < 0.7 * relmse(noisy.mean, truth)
+    assert 0.93 < result.color.mean() / truth.mean() < 1.07
+    assert any("alpha takes the albedo's place" in note for note in result.notes)
+    # An albedo contains the coverage.
+    albedo = Buffer(np.repeat(alpha, 3, axis=2))
+    np.testing.assert_array_equal(
+        denoise(RenderBuffers(noisy, albedo=albedo, alpha=alpha), draft).color, result.color
+    )
+
+
 def test_ctrl_c_after_the_training_leaves_what_was_trained(
     render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,3 +59,25 @@ def test_emitted_light_is_split_as_the_colour_is() -> None:
     for light, emitted in zip(split.color.halves, split.albedo.halves, strict=True):
         np.testing.assert_allclose((emitted - 1)[10:20, 10:20] / 8, light[10:20, 10:20] / 9, rtol=1e-5)
         np.testing.assert_array_equal(emitted[25:], albedo[25:])
+
+
+def test_noise_of_each_channel_is_split_as_it_is_correlated() -> None:
+    rng = np.random.default_rng(7)
+    color = np.array([0.2, 0.5, 0.9], np.float32)
+    for independent in (True, False):
+        noise = rng.gamma(4, 1 / 4, (90, 120, 3 if independent else 1))
+        split = with_independent_halves(RenderBuffers(Buffer((color * noise).astype(np.float32))), (), 0, 2)[
+            0
+        ]
+        assert split.color.halves is not None
+        a, b = (half / color - 1 for half in split.color.halves)
+        for first in range(3):
+            # No noise is left in both halves: neither of a channel nor of the difference of two.
+            assert abs(np.corrcoef(a[..., first].ravel(), b[..., first].ravel())[0, 1]) < 0.15
+            second = (first + 1) % 3
+            hue_a, hue_b = (half[..., first] - half[..., second] for half in (a, b))
+            if independent:
+                assert abs(np.corrcoef(hue_a.ravel(), hue_b.ravel())[0, 1]) < 0.15
+            else:
+                # There is hardly a difference.
+                assert max(hue_a.std(), hue_b.std()) < 0.3 * a.std()

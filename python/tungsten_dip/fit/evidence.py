@@ -381,9 +381,12 @@ def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImag
 
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
-    """Return a note on missing features, if there are any."""
+    """Return notes on missing features, if there are any."""
     missing = [name for name in FEATURES if getattr(buffers, name) is None]
-    return (f"no {', '.join(missing)}: edges are found with less evidence",) if missing else ()
+    if not missing:
+        return ()
+    replaced = "; alpha takes the albedo's place" if "albedo" in missing and buffers.alpha is not None else ""
+    return (f"no {', '.join(missing)}: edges are found with less evidence{replaced}",)
 
 
 def scaled(image: FloatImage, scale: float) -> FloatImage:

@@ -173,6 +173,9 @@ def guidance_of_halves(
     that scores them would be mistaken for signal.
     """
     count = len(colors)
+    if buffers.albedo is None and buffers.alpha is not None:
+        # Premultiplied colour is a surface's times its coverage, as it is its irradiance times its albedo.
+        buffers = replace(buffers, albedo=_albedo_from_alpha(buffers.alpha))
     albedos: tuple[FloatImage, ...] = ()
     if buffers.albedo is not None:
         rendered = _without_stray_emission(buffers.albedo, threads)
@@ -193,6 +196,11 @@ def guidance_of_halves(
         _guidance(planes, flat, surface, color.shape, scale, threads)
         for planes, surface, color in zip(planes_of_colors, surfaces, colors, strict=True)
     )
+
+
+def _albedo_from_alpha(alpha: FloatImage) -> Buffer:
+    covered = np.clip(np.nan_to_num(alpha), 0, 1)
+    return Buffer(np.repeat(covered, 3, axis=2))
 
 
 def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: float) -> tuple[FloatImage, ...]:

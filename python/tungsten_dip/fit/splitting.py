@@ -29,6 +29,8 @@ _MEAN_RADIUS = 2
 _NOISE_RADIUS = 1
 """Of the windows of the mean that a pixel differs from, and of the mean squared difference."""
 
+_CORRELATION_RADIUS = 8
+
 _LEAST_SHAPE = 1e-2
 """One half has nearly all of such a pixel: a single sample was so bright."""
 
@@ -80,28 +82,50 @@ def with_independent_halves(
 
 
 def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:
-    """Return T, shape (height, width, 1), drawn according to the noise around a pixel."""
+    """Return T, shape (height, width, 3), drawn according to the noise around a pixel.
+
+    It is the same for all channels in as many pixels as their noise is correlated: of a path that found light
+    all channels are bright, but not of one that a spectral renderer traced for a single wavelength.
+    """
     image = scaled(color, exposure(color))
     drawn = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
     around = _core.box_mean(image, _MEAN_RADIUS, threads)
-    apart = _sum_of_squares(image - around).astype(np.float32)[:, :, None]
-    noise = _core.box_mean(apart, _NOISE_RADIUS, threads)[:, :, 0].astype(np.float64)
-    shape = np.clip(_sum_of_squares(around) / np.maximum(noise, 1e-30), _LEAST_SHAPE, _LARGEST_SHAPE)
+    squared = (image - around).astype(np.float64) ** 2
+    noise = _core.box_mean(squared.astype(np.float32), _NOISE_RADIUS, threads).astype(np.float64)
+    level = around.astype(np.float64) ** 2
     # The edges of a lamp in plain view are mistaken for noise, but no half may be without it.
-    level = channel_mean(emitted)
-    lit = (level > 0) & (level <= np.float32(_STRAY) * mean_around(level, 1, threads))
-    shape[lit[:, :, 0]] = np.maximum(shape[lit[:, :, 0]], _LEAST_SHAPE_OF_LAMPS)
-    return drawn.beta(shape / 2, shape / 2).astype(np.float32)[:, :, None]
+    light = channel_mean(emitted)
+    lit = (light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads))
+
+    def beta(level: _Plane, noise: _Plane) -> _Plane:
+        shape = np.clip(level / np.maximum(noise, 1e-30), _LEAST_SHAPE, _LARGEST_SHAPE)
+        shape = np.where(lit, np.maximum(shape, _LEAST_SHAPE_OF_LAMPS), shape)
+        return drawn.beta(shape / 2, shape / 2)
+
+    common = beta(level.sum(axis=2, keepdims=True), noise.sum(axis=2, keepdims=True))
+    single = beta(level, noise)
+    correlated = drawn.random(lit.shape) < _correlation(image, around, threads)
+    share = np.where(correlated | lit, common, single)
+    share_of_a: FloatImage = share.astype(np.float32)
+    return share_of_a
+
+
+def _correlation(image: FloatImage, around: FloatImage, threads: int) -> FloatImage:
+    """Return the correlation, 0 to 1, of the channels' noise around a pixel, shape (height, width, 1)."""
+    relative = (image - around) / np.maximum(around, np.float32(1e-15))
+    variance, total = (
+        _core.box_mean(values, _CORRELATION_RADIUS, threads)
+        for values in (channel_mean(relative**2), channel_mean(relative) ** 2)
+    )
+    # (a + b + c)^2 = a^2 + b^2 + c^2 + 2 (ab + bc + ca)
+    covariance = (3 * total - variance) / 2
+    correlation: FloatImage = np.clip(covariance / np.maximum(variance, np.float32(1e-30)), 0, 1)
+    return correlation
 
 
 def _split(image: FloatImage, share: FloatImage) -> Halves:
     twice = 2 * image
     return twice * share, twice * (1 - share)
-
-
-def _sum_of_squares(image: FloatImage) -> _Plane:
-    squares: _Plane = np.einsum("...c,...c", image, image, dtype=np.float64)
-    return squares
 
 
 def _why(buffers: RenderBuffers, test: HalvesTest) -> str:
