@@ -9,6 +9,7 @@ from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import silent
@@ -31,4 +32,4 @@ def session_of(model: Model) -> Any:
 
 def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
     """Return what a fit of preset draft knows of the buffers, with other pilots."""
-    return evidence_from_buffers(buffers, DRAFT, pilots, (), Clock(), silent, None, None, False)
+    return evidence_from_buffers(HalvedImage(buffers), DRAFT, pilots, Clock(), silent, None, None)

@@ -16,10 +16,11 @@ def _gamma_noise(shape: float) -> RenderBuffers:
 def test_the_halves_of_gamma_noise_are_independent_and_as_noisy_as_real_ones() -> None:
     for shape in (1.0, 4.0, 30.0):
         buffers = _gamma_noise(shape)
-        split, _, notes = with_independent_halves(buffers, (), 0, 1)
-        assert "no half buffers" in notes[0]
-        assert split.color.halves is not None
-        a, b = (half[..., 0] - 1 for half in split.color.halves)
+        halved = with_independent_halves(buffers, (), 0, 1)
+        assert halved.drawn
+        assert "no half buffers" in halved.notes[0]
+        assert halved.buffers.color.halves is not None
+        a, b = (half[..., 0] - 1 for half in halved.buffers.color.halves)
         np.testing.assert_allclose((a + b) / 2, buffers.color.mean[..., 0] - 1, atol=1e-5)
         assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.1
         for half in (a, b):
@@ -31,7 +32,7 @@ def test_other_seeds_and_images_are_split_otherwise() -> None:
     other = RenderBuffers(Buffer(np.ascontiguousarray(buffers.color.mean[::-1])))
 
     def share(image: RenderBuffers, seed: int) -> np.ndarray:
-        half = with_independent_halves(image, (), seed, 1)[0].color.half_a
+        half = with_independent_halves(image, (), seed, 1).buffers.color.half_a
         assert half is not None
         return half / image.color.mean
 
@@ -42,7 +43,7 @@ def test_other_seeds_and_images_are_split_otherwise() -> None:
 
 def test_what_has_no_noise_is_not_torn_apart() -> None:
     flat = RenderBuffers(Buffer(np.full((20, 30, 3), 0.7, np.float32)))
-    halves = with_independent_halves(flat, (), 0, 1)[0].color.halves
+    halves = with_independent_halves(flat, (), 0, 1).buffers.color.halves
     assert halves is not None
     for half in halves:
         np.testing.assert_allclose(half, 0.7, rtol=1e-3)
@@ -52,7 +53,7 @@ def test_emitted_light_is_split_as_the_colour_is() -> None:
     color = np.random.default_rng(5).gamma(2, 0.5, (40, 40, 3)).astype(np.float32)
     albedo = np.full_like(color, 0.5)
     color[10:20, 10:20] = albedo[10:20, 10:20] = 9
-    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1)[0]
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1).buffers
     assert split.color.halves is not None
     assert split.albedo is not None
     assert split.albedo.halves is not None

@@ -15,6 +15,7 @@ from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Ren
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.fireflies import Limited, limit_fireflies
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
@@ -30,15 +31,10 @@ from tungsten_dip.fit.pilots import (
     guidance_of_halves,
 )
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitSettings
+from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.progress import Progress
 
 Indices = npt.NDArray[np.int64]
-
-_TYPICAL_RADIANCE = 0.25
-"""Images are scaled so that their lit pixels have about this median: every constant below relies on it."""
-
-_BRIGHTEST = 1e15
-"""Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
 
 SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
@@ -144,38 +140,35 @@ class Evidence:
 
 
 def evidence_from_buffers(
-    buffers: RenderBuffers,
+    image: HalvedImage,
     settings: FitSettings,
     pilots: Sequence[Pilot],
-    candidates: Sequence[Halves],
     clock: Clock,
     progress: Progress,
     previous: Halves | None,
     layout: Layout | None,
-    halves_drawn: bool,
 ) -> Evidence:
-    """Compute the pilots of sanitised buffers, as many as the time budget lets begin (one at least).
+    """Compute the pilots of an image, as many as the time budget lets begin (one at least).
 
-    The buffers have halves, and their noise is independent (`splitting`). ``candidates`` are further pilots
-    that the caller supplies, of linear radiance. ``previous`` is one more, NaN where it has no value, that
-    guides the others as well. ``layout`` is that of a fitted network, and ``pilots`` are its pilots: all of
-    them are computed. ``halves_drawn``: the halves were drawn from the image, and candidates left out.
+    ``previous`` is a candidate, NaN where it has no value, that guides the pilots as well. ``layout`` is that
+    of a fitted network, and ``pilots`` are its pilots: all of them are computed.
 
     Raises InputError if the layout has a feature that is missing or another number of candidates.
     """
+    buffers = image.buffers
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
     mean, limited = _without_fireflies(buffers.color, scale, threads)
     halves = limited.halves
     guidance = guidance_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
-    handed_in = [_scaled_halves(pair, scale) for pair in candidates]
+    candidates = [_scaled_halves(pair, scale) for pair in image.candidates]
     if settings.pilot == "oidn":
         # The last of them: `pilots_of_all_samples` relies on it.
-        handed_in.append(_scaled_halves(_oidn_halves(buffers, halves, scale, settings.threads), scale))
+        candidates.append(_scaled_halves(_oidn_halves(buffers, halves, scale, settings.threads), scale))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, guidance[0], len(handed_in) + (previous is not None), halves_drawn)
+        _check_fits(layout, guidance[0], len(candidates) + (previous is not None), image.drawn)
 
     occupied = _occupied(halves, buffers, threads)
     guides, known, filled = _guides(halves, guidance, previous, scale, occupied)
@@ -183,12 +176,12 @@ def evidence_from_buffers(
     budget = clock if layout is None else Clock()
     computed = _computed(maker, pilots, known, occupied, budget, progress)
     if filled is not None:
-        handed_in.append(filled)
+        candidates.append(filled)
 
-    images = (halves, *computed, *handed_in)
+    images = (halves, *computed, *candidates)
     reference, noises = _judged(images, computed[-1], threads, None if layout is None else layout.reference)
     if layout is None:
-        layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(handed_in), reference)
+        layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(candidates), reference)
     features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
     notes = _notes_on_features(buffers)
     if limited.note is not None:
@@ -279,11 +272,11 @@ def pilots_of_all_samples(
         if given_up is not None and given_up.is_set():
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
-    handed_in = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
+    candidates = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
-        handed_in[-1] = scaled(image, evidence.scale)
-    return (evidence.mean, *computed, *handed_in)
+        candidates[-1] = scaled(image, evidence.scale)
+    return (evidence.mean, *computed, *candidates)
 
 
 def with_best_reference(evidence: Evidence) -> Evidence:
@@ -318,14 +311,14 @@ def _noises(errors_of_reference: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, guidance: Guidance, candidates: int, halves_drawn: bool) -> None:
+def _check_fits(layout: Layout, guidance: Guidance, candidates: int, drawn: bool) -> None:
     unknown = [n for n in layout.features if n not in guidance.names and n not in guidance.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
         )
-    if layout.candidates > candidates and halves_drawn:
+    if layout.candidates > candidates and drawn:
         raise InputError(
             "the model chooses among candidates, which cannot be judged without independent halves; fit "
             "without the model"
@@ -389,21 +382,6 @@ def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
     return (f"no {', '.join(missing)}: edges are found with less evidence{replaced}",)
 
 
-def scaled(image: FloatImage, scale: float) -> FloatImage:
-    """Return radiance in the units of the evidence, bounded so that squares do not overflow."""
-    brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
-    bounded: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
-    return bounded
-
-
-def unscaled(image: FloatImage, scale: float) -> FloatImage:
-    """Return an image of the evidence in the renderer's units, bounded for float32."""
-    largest = float(np.finfo(np.float32).max)
-    bounded: FloatImage = np.minimum(image, np.float32(min(largest * scale, largest)))
-    bounded /= np.float32(scale)
-    return bounded
-
-
 def denominators_of(smooth: Halves) -> Halves:
     """What squared errors are relative to, per half, shape (height, width, 1)."""
     a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
@@ -426,12 +404,3 @@ def _capped(error: FloatImage, threads: int) -> FloatImage:
     limit = np.float32(OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
     capped: FloatImage = np.minimum(error, limit)
     return capped
-
-
-def exposure(color: FloatImage) -> float:
-    """Return the power of two that brings the median of the lit pixels near the typical radiance."""
-    level = color.mean(axis=2, dtype=np.float64)
-    lit = level[level > 0]
-    if lit.size == 0:
-        return 1.0
-    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))

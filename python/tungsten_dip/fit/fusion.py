@@ -75,17 +75,12 @@ def fit_fusion(
     if unchanged is not None:
         progress(1.0, "no noise")
         return unchanged
-    buffers, candidates, notes = with_independent_halves(
-        buffers, tuple(candidates), settings.seed, settings.threads
-    )
-    drawn = bool(notes)
+    halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
     following = previous is not None
     preset = _preset(settings, following)
     layout = None if warm_start is None else warm_start.layout
     pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
-    evidence = evidence_from_buffers(
-        buffers, settings, pilots, candidates, clock, progress, previous, layout, drawn
-    )
+    evidence = evidence_from_buffers(halved, settings, pilots, clock, progress, previous, layout)
     # A time budget is better spent on the steps of one.
     members = preset.members if settings.time_budget_s is None else 1
     start = start_of_training(evidence, settings.seed, warm_start, members)
@@ -96,11 +91,11 @@ def fit_fusion(
 
     def whole_pilots(given_up: Event) -> tuple[FloatImage, ...]:
         # The previous frame moved into place has no counterpart among them.
-        return () if following else pilots_of_all_samples(evidence, buffers, settings, clock, given_up)
+        return () if following else pilots_of_all_samples(evidence, halved.buffers, settings, clock, given_up)
 
     training, images = _trained(network, start, settings, preset, clock, progress, whole_pilots)
     fused, whole = _fused(network, start, images)
-    notes = (*notes, *training.notes)
+    notes = (*halved.notes, *training.notes)
     result = result_from_fused(
         evidence, fused, whole, settings, clock, training.steps_done, training.history, notes
     )
@@ -116,7 +111,7 @@ def fit_fusion(
     )
     if not training.interrupted:
         progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
-    return replace(result, model=model, halves_drawn=drawn, interrupted=training.interrupted)
+    return replace(result, model=model, halves_drawn=halved.drawn, interrupted=training.interrupted)
 
 
 def _preset(settings: FitSettings, following: bool) -> _Preset:

@@ -13,7 +13,8 @@ from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuf
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.evidence import Evidence, exposure, unscaled
+from tungsten_dip.fit.evidence import Evidence
+from tungsten_dip.fit.exposure import exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_lost_detail
 from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
 

@@ -10,6 +10,8 @@ needs.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +22,7 @@ from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent
 from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import noise_in
 from tungsten_dip.cores import thread_count
-from tungsten_dip.fit.evidence import exposure, scaled
+from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.neighbours import mean_around
 
 _Plane = npt.NDArray[np.float64]
@@ -45,10 +47,23 @@ _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
 
 
+@dataclass(frozen=True)
+class HalvedImage:
+    """Sanitised buffers whose colour has independent halves, and the candidates that these can score.
+
+    ``drawn`` indicates that the halves were drawn from the image; ``notes`` say why.
+    """
+
+    buffers: RenderBuffers
+    candidates: tuple[Halves, ...] = ()
+    drawn: bool = False
+    notes: tuple[str, ...] = ()
+
+
 def with_independent_halves(
-    buffers: RenderBuffers, candidates: tuple[Halves, ...], seed: int, threads: int | None
-) -> tuple[RenderBuffers, tuple[Halves, ...], tuple[str, ...]]:
-    """Return sanitised buffers with independent halves of the colour, candidates that these can score, notes.
+    buffers: RenderBuffers, candidates: Sequence[Halves], seed: int, threads: int | None
+) -> HalvedImage:
+    """Return sanitised buffers with independent halves of the colour.
 
     Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is estimated
     from the difference of pixels and their surroundings. Then no candidate can be used: it was computed from
@@ -59,7 +74,7 @@ def with_independent_halves(
     # Tiny or uniform images cannot be tested: their halves are used unless they are copies.
     untestable = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
     if test.independent or untestable:
-        return buffers, candidates, ()
+        return HalvedImage(buffers, tuple(candidates))
     emitted = np.zeros_like(color.mean)
     if buffers.albedo is not None:
         emitted = np.maximum(buffers.albedo.mean - 1, 0)
@@ -78,7 +93,7 @@ def with_independent_halves(
         half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
         variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
         split["albedo"] = Buffer(albedo.mean, half_a, half_b, variance)
-    return buffers.with_quantities(**split), (), tuple(notes)
+    return HalvedImage(buffers.with_quantities(**split), drawn=True, notes=tuple(notes))
 
 
 def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:

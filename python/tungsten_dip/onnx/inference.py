@@ -96,21 +96,16 @@ def infer_fusion(
     if unchanged is not None:
         progress(1.0, "no noise")
         return unchanged
-    buffers, candidates, notes = with_independent_halves(
-        buffers, tuple(candidates), settings.seed, settings.threads
-    )
-    drawn = bool(notes)
+    halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
     layout = model.layout
-    evidence = evidence_from_buffers(
-        buffers, settings, layout.pilots, candidates, clock, progress, previous, layout, drawn
-    )
+    evidence = evidence_from_buffers(halved, settings, layout.pilots, clock, progress, previous, layout)
     whole_pilots: tuple[FloatImage, ...] = ()
     if previous is None:
-        whole_pilots = pilots_of_all_samples(evidence, buffers, settings, clock)
+        whole_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
     fused, whole = _fused(model, evidence, whole_pilots)
-    result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), notes)
+    result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), halved.notes)
     progress(1.0, "inferred")
-    return replace(result, model=model, halves_drawn=drawn)
+    return replace(result, model=model, halves_drawn=halved.drawn)
 
 
 def _fused(

@@ -1,0 +1,37 @@
+"""The units in which fits compute: radiance scaled to a typical level, by a power of two."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tungsten_dip.buffers.model import FloatImage
+
+_TYPICAL_RADIANCE = 0.25
+"""Images are scaled so that their lit pixels have about this median: every constant of `fit` relies on it."""
+
+_BRIGHTEST = 1e15
+"""Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
+
+
+def exposure(color: FloatImage) -> float:
+    """Return the power of two that brings the median of the lit pixels near the typical radiance."""
+    level = color.mean(axis=2, dtype=np.float64)
+    lit = level[level > 0]
+    if lit.size == 0:
+        return 1.0
+    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
+
+
+def scaled(image: FloatImage, scale: float) -> FloatImage:
+    """Return radiance times ``scale``, bounded so that squares do not overflow."""
+    brightest = min(_BRIGHTEST / scale, float(np.finfo(np.float32).max))
+    bounded: FloatImage = np.minimum(image, np.float32(brightest)) * np.float32(scale)
+    return bounded
+
+
+def unscaled(image: FloatImage, scale: float) -> FloatImage:
+    """Undo `scaled`, except for its bound; the result is bounded for float32."""
+    largest = float(np.finfo(np.float32).max)
+    bounded: FloatImage = np.minimum(image, np.float32(min(largest * scale, largest)))
+    bounded /= np.float32(scale)
+    return bounded
