@@ -223,7 +223,7 @@ def test_candidates_reach_the_network(frame: SyntheticRender) -> None:
     assert fit.model is not None
     inferred = infer(fit.model, frame.buffers, threads=1, candidates=[(truth, truth)])
     np.testing.assert_allclose(inferred.color, fit.color, rtol=1e-5)
-    with pytest.raises(InputError, match="fitted with 1 candidates, this input comes with 0"):
+    with pytest.raises(InputError, match=r"fitted with 1 candidates .*, this input comes with 0"):
         infer(fit.model, frame.buffers)
 
 

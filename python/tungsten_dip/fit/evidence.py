@@ -53,9 +53,9 @@ _DRAFT_SHARE = 0.7
 class Layout:
     """The inputs of a network and the images it chooses among: the same for every image that it is used on.
 
-    ``features`` names channels of the features. The images are the noisy one, then the ``pilots``, then
-    ``candidates`` images that the caller supplies. ``reference`` is the index of the pilot that the others
-    are compared with.
+    ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
+    filters compute, then so many ``candidates``: the caller's, Open Image Denoise's, the previous frame.
+    ``reference`` is the index of the pilot that the others are compared with.
     """
 
     features: tuple[str, ...]
@@ -89,7 +89,7 @@ class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
-    (height, width). ``pilots`` holds both halves of every pilot, the noisy halves themselves first.
+    (height, width). ``pilots`` holds both halves of the noisy image, of every pilot, of every candidate.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and the
     other half, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`).
@@ -325,8 +325,8 @@ def _check_fits(layout: Layout, guidance: Guidance, candidates: int, drawn: bool
         )
     if layout.candidates != candidates:
         raise InputError(
-            f"the model was fitted with {layout.candidates} candidates, this input comes with "
-            f"{candidates}; give as many, or fit without the model"
+            f"the model was fitted with {layout.candidates} candidates (other denoisers' images or the "
+            f"previous frame), this input comes with {candidates}; give as many, or fit without the model"
         )
 
 
