@@ -253,10 +253,10 @@ def pilots_of_all_samples(
     """Return the pilots of all samples, with less noisy features and guides than a half's.
 
     One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
-    all for the preset draft, or where the pilots of the halves have used up their share of the time budget,
-    or once ``given_up`` is set.
+    all where the pilots of the halves have used up their share of the time budget, or once ``given_up`` is
+    set.
     """
-    if settings.preset == "draft" or clock.share_spent() > _PILOTS_SHARE:
+    if clock.share_spent() > _PILOTS_SHARE:
         return ()
     colors = (evidence.mean,)
     guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.threads)

@@ -52,10 +52,14 @@ class _Preset:
     batch_pixels: int = _BATCH_PIXELS
     members: int = 1
     following: tuple[Pilot, ...] = FOLLOWING_PILOTS
+    all_samples: bool = True
+    """Whether the pilots are computed from all samples, too."""
 
 
 _PRESETS = {
-    "draft": _Preset(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, following=FOLLOWING_DRAFT_PILOTS),
+    "draft": _Preset(
+        DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, following=FOLLOWING_DRAFT_PILOTS, all_samples=False
+    ),
     "balanced": _Preset(BALANCED_PILOTS, 240),
     "final": _Preset(FINAL_PILOTS, 240, members=4),
 }
@@ -90,8 +94,9 @@ def fit_fusion(
     )
 
     def whole_pilots(given_up: Event) -> tuple[FloatImage, ...]:
-        # The previous frame moved into place has no counterpart among them.
-        return () if following else pilots_of_all_samples(evidence, halved.buffers, settings, clock, given_up)
+        if not preset.all_samples:
+            return ()
+        return pilots_of_all_samples(evidence, halved.buffers, settings, clock, given_up)
 
     training, images = _trained(network, start, settings, preset, clock, progress, whole_pilots)
     fused, whole = _fused(network, start, images)
@@ -116,7 +121,15 @@ def fit_fusion(
 
 def _preset(settings: FitSettings, following: bool) -> _Preset:
     preset = _PRESETS[settings.preset]
-    return _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS) if following else preset
+    if not following:
+        return preset
+    # The previous frame moved into place has no counterpart among the pilots of all samples.
+    return _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS, all_samples=False)
+
+
+def blends_all_samples(settings: FitSettings, following: bool) -> bool:
+    """Whether the preset blends the pilots of all samples, too: never in a frame ``following`` another."""
+    return _preset(settings, following).all_samples
 
 
 def _pilots(

@@ -14,6 +14,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
+from tungsten_dip.fit.fusion import blends_all_samples
 from tungsten_dip.fit.model import Model, check_finite, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
@@ -100,7 +101,7 @@ def infer_fusion(
     layout = model.layout
     evidence = evidence_from_buffers(halved, settings, layout.pilots, clock, progress, previous, layout)
     whole_pilots: tuple[FloatImage, ...] = ()
-    if previous is None:
+    if blends_all_samples(settings, following=previous is not None):
         whole_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
     fused, whole = _fused(model, evidence, whole_pilots)
     result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), halved.notes)
