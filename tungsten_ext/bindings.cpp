@@ -15,27 +15,27 @@ namespace {
 
 using FloatArray = py::array_t<float, py::array::c_style>;
 
-// An array over memory that lives as long as any array of the same evidence.
+// An array over memory that lives as long as any array of the same render.
 // NOLINTNEXTLINE(misc-const-correctness): numpy may write to it
-py::object array_over(const Evidence& evidence, float* data, int channels) {
+py::object array_over(const RenderBuffers& buffers, float* data, int channels) {
     if (data == nullptr) return py::none();
-    const py::capsule owner(new std::shared_ptr<void>(evidence.memory),
+    const py::capsule owner(new std::shared_ptr<void>(buffers.memory),
                             [](void* shared) { delete static_cast<std::shared_ptr<void>*>(shared); });
-    return FloatArray({evidence.height, evidence.width, channels}, data, owner);
+    return FloatArray({buffers.height, buffers.width, channels}, data, owner);
 }
 
-py::dict dict_from_evidence(const Evidence& evidence) {
+py::dict dict_from_buffers(const RenderBuffers& buffers) {
     py::dict result;
-    for (const QuantityPlanes& quantity : evidence.quantities) {
+    for (const QuantityPlanes& quantity : buffers.quantities) {
         py::dict planes;
-        planes["mean"] = array_over(evidence, quantity.mean, quantity.channels);
-        planes["half_a"] = array_over(evidence, quantity.half_a, quantity.channels);
-        planes["half_b"] = array_over(evidence, quantity.half_b, quantity.channels);
-        planes["variance"] = array_over(evidence, quantity.variance, quantity.channels);
+        planes["mean"] = array_over(buffers, quantity.mean, quantity.channels);
+        planes["half_a"] = array_over(buffers, quantity.half_a, quantity.channels);
+        planes["half_b"] = array_over(buffers, quantity.half_b, quantity.channels);
+        planes["variance"] = array_over(buffers, quantity.variance, quantity.channels);
         result[quantity.name] = planes;
     }
     result["spp"] =
-        evidence.spp != nullptr ? array_over(evidence, evidence.spp, 1) : py::float_(evidence.uniform_spp);
+        buffers.spp != nullptr ? array_over(buffers, buffers.spp, 1) : py::float_(buffers.uniform_spp);
     return result;
 }
 
@@ -108,25 +108,25 @@ void bind(const py::module_& module) {
         .def("save_checkpoint", &Render::save_checkpoint, py::call_guard<py::gil_scoped_release>())
         .def("save_outputs", &Render::save_outputs, py::call_guard<py::gil_scoped_release>())
         .def(
-            "evidence",
+            "buffers",
             [](const Render& render) {
-                const auto evidence = [&] {
+                const auto buffers = [&] {
                     const py::gil_scoped_release release;
-                    return render.evidence();
+                    return render.buffers();
                 }();
-                return dict_from_evidence(evidence);
+                return dict_from_buffers(buffers);
             },
             "A copy of what is known so far: {quantity: {mean, half_a, half_b, variance}, 'spp': ...}.")
         .def(
-            "take_evidence",
+            "take_buffers",
             [](Render& render) {
-                const auto evidence = [&] {
+                const auto buffers = [&] {
                     const py::gil_scoped_release release;
-                    return render.take_evidence();
+                    return render.take_buffers();
                 }();
-                return dict_from_evidence(evidence);
+                return dict_from_buffers(buffers);
             },
-            "Tungsten's own buffers as arrays, without a copy, as evidence() has them; ends the render.");
+            "Tungsten's own buffers as arrays, without a copy, as buffers() has them; ends the render.");
 }
 
 }  // namespace tungsten_dip

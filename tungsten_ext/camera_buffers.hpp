@@ -66,13 +66,13 @@ BufferBlocks blocks_of(const Tungsten::OutputBuffer<T>& buffer) {
     return {floats(0), floats(1), floats(2), reinterpret_cast<const std::uint32_t*>(addresses.blocks[3])};
 }
 
-// Memory for the means of an Evidence, one array per quantity, all pages touched.
+// Memory for the means of RenderBuffers, one array per quantity, all pages touched.
 std::vector<std::vector<float>> means_for(const Tungsten::Camera& camera, bool features);
 
-// Turns the camera's buffers into an Evidence. With `take` they are moved out of the camera and nothing is
+// Turns the camera's buffers into RenderBuffers. With `take` they are moved out of the camera and nothing is
 // copied; otherwise the render may go on. Without `features` the integrator fills colour alone, and in part
 // by splatting.
-Evidence evidence_of(Tungsten::Camera& camera, std::uint32_t spp, bool features,
-                     std::vector<std::vector<float>> means, bool take);
+RenderBuffers buffers_of(Tungsten::Camera& camera, std::uint32_t spp, bool features,
+                         std::vector<std::vector<float>> means, bool take);
 
 }  // namespace tungsten_dip

@@ -84,8 +84,8 @@ bool has_complete_output(const RendererSettings& settings, int type) {
     return complete;
 }
 
-// A state saved with other buffers cannot be read back, so renders with evidence keep their own.
-std::string resume_file_with_evidence(const std::string& path) {
+// A state saved with other buffers cannot be read back, so renders that ask for all keep their own.
+std::string resume_file_with_all_buffers(const std::string& path) {
     const auto dot = path.find_last_of("./\\");
     const bool has_extension = dot != std::string::npos && path[dot] == '.';
     return has_extension ? path.substr(0, dot) + "_dip" + path.substr(dot) : path + "_dip";
@@ -104,14 +104,14 @@ uint64 scene_hash(const Scene& scene) {
 }
 
 // The settings' own reader takes our additions as if they stood in the scene file; what is not named stays.
-void ask_for_evidence(Scene& scene, bool writes_features) {
+void ask_for_buffers(Scene& scene, bool writes_features) {
     RendererSettings& settings = scene.rendererSettings();
     rapidjson::Document additions;
     additions.SetObject();
     auto& allocator = additions.GetAllocator();
     // Even and odd Sobol points mirror each other, so the halves would not be independent.
     additions.AddMember("stratified_sampler", false, allocator);
-    const std::string resume_file = resume_file_with_evidence(settings.resumeRenderFile().asString());
+    const std::string resume_file = resume_file_with_all_buffers(settings.resumeRenderFile().asString());
     additions.AddMember("resume_render_file", rapidjson::Value(resume_file.c_str(), allocator), allocator);
     rapidjson::Value outputs(rapidjson::kArrayType);
     for_each_quantity([&](OutputBufferTypeEnum type, const char* name, auto) {
@@ -153,7 +153,7 @@ struct Render::Impl {
     std::future<void> pass;
     RenderPlan plan;
     std::uint32_t total_spp;
-    // For take_evidence: memory written to for the first time is most of what a hand-over would cost.
+    // For take_buffers: memory written to for the first time is most of what a hand-over would cost.
     std::vector<std::vector<float>> means;
 
     [[nodiscard]] Integrator& integrator() const {
@@ -198,7 +198,7 @@ Render::Render(const std::string& scene_path, const RenderOptions& options) : im
     const DirectoryChange context(self.input_directory);
     const bool writes_features = dynamic_cast<PathTraceIntegrator*>(self.scene->integrator()) != nullptr;
     const std::size_t own_outputs = settings.renderOutputs().size();
-    ask_for_evidence(*self.scene, writes_features);
+    ask_for_buffers(*self.scene, writes_features);
     if (output_directory) settings.setOutputDirectory(*output_directory);
     for (std::size_t i = 0; i < own_outputs; ++i) {  // a later entry replaces an earlier one, as in Tungsten
         const OutputBufferSettings& output = settings.renderOutputs()[i];
@@ -317,20 +317,21 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
     own.save();
 }
 
-Evidence Render::evidence() const {
+RenderBuffers Render::buffers() const {
     const std::uint32_t spp = current_spp();  // throws where there is no scene any more
     Camera& camera = *impl_->scene->camera();
     const bool features = impl_->plan.writes_features;
-    return evidence_of(camera, spp, features, means_for(camera, features), false);
+    return buffers_of(camera, spp, features, means_for(camera, features), false);
 }
 
-Evidence Render::take_evidence() {
+RenderBuffers Render::take_buffers() {
     const std::uint32_t spp = current_spp();  // throws where there is no scene any more
     Camera& camera = *impl_->scene->camera();
-    Evidence evidence = evidence_of(camera, spp, impl_->plan.writes_features, std::move(impl_->means), true);
+    RenderBuffers buffers =
+        buffers_of(camera, spp, impl_->plan.writes_features, std::move(impl_->means), true);
     impl_->traceable.reset();
     impl_->scene.reset();
-    return evidence;
+    return buffers;
 }
 
 const char* tungsten_version() { return VERSION_STRING; }

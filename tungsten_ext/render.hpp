@@ -1,4 +1,4 @@
-// One scene rendered by Tungsten, and the evidence in its camera's output buffers. Knows neither Python nor
+// One scene rendered by Tungsten, and what is in its camera's output buffers. Knows neither Python nor
 // Tungsten; what includes Tungsten's headers is compiled as Tungsten was, and meets the rest only here.
 #pragma once
 
@@ -39,7 +39,7 @@ struct QuantityPlanes {
 
 // What one render knows. `memory` owns every array; `spp` is null where every pixel has `uniform_spp`
 // samples.
-struct Evidence {
+struct RenderBuffers {
     int width;
     int height;
     std::vector<QuantityPlanes> quantities;
@@ -66,7 +66,7 @@ struct PictureTooLarge : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
-// A loaded scene that asks for the evidence a fit needs: independent sampler, halves and variance of every
+// A loaded scene that asks for the buffers a fit needs: independent sampler, halves and variance of every
 // quantity the integrator writes. The scene's own buffer files are still written as the scene asks. One at a
 // time per process. Every method throws std::runtime_error (or what Tungsten throws) with a message in words;
 // the constructor PictureTooLarge with the size of an image of more than `max_pixels`.
@@ -82,7 +82,7 @@ class Render {
     [[nodiscard]] std::uint32_t total_spp() const;
     [[nodiscard]] bool done() const;
 
-    // Continues from the saved state of an earlier render with evidence; false where there is none that fits.
+    // Continues from the state that an earlier render saved; false where there is none that fits.
     bool resume();
 
     // Renders one pass (`spp_step` samples per pixel): start it, then wait until wait_for_pass returns true.
@@ -93,10 +93,10 @@ class Render {
     void save_outputs();
 
     // A copy of what is known so far; the render may go on.
-    [[nodiscard]] Evidence evidence() const;
+    [[nodiscard]] RenderBuffers buffers() const;
     // The buffers themselves, without a copy (only the means are computed). The scene is freed; the render is
     // over.
-    Evidence take_evidence();
+    RenderBuffers take_buffers();
 
   private:
     struct Impl;

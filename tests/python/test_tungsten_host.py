@@ -441,9 +441,9 @@ def test_the_native_command_runs_no_code_beside_the_scene(tmp_path):
 
 
 @in_process
-def test_evidence_that_is_taken_is_gone(write_scene):
+def test_buffers_that_are_taken_are_gone(write_scene):
     session = tungsten._load(write_scene(), tungsten.DriverOptions(spp=1))
-    session.take_evidence()
-    for again in (session.take_evidence, session.evidence):
+    session.take_buffers()
+    for again in (session.take_buffers, session.buffers):
         with pytest.raises(RuntimeError):
             again()

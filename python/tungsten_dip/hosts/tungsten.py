@@ -34,7 +34,7 @@ _LOG = logging.getLogger(__name__)
 
 BUILD_HINT = "build the package with Tungsten_ROOT set to a Tungsten checkout (docs/tungsten.md)"
 
-Evidence = Mapping[str, Any]
+_Arrays = Mapping[str, Any]
 """What the hook hands over: {quantity: {mean, half_a, half_b, variance}, "spp": a number or an array}."""
 
 
@@ -127,7 +127,7 @@ def render(
     session = _load(Path(scene_path), options)
     if _render_passes(session, Path(scene_path), options, None, progress):
         raise KeyboardInterrupt
-    return _buffers(session.plan, session.take_evidence())
+    return _buffers(session.plan, session.take_buffers())
 
 
 def drive(
@@ -153,10 +153,10 @@ def drive(
     session = _load(Path(scene_path), options)
     plan = session.plan
 
-    def rendered(evidence: Evidence) -> Rendered:
+    def rendered(arrays: _Arrays) -> Rendered:
         output_file = Path(plan.output_file) if plan.output_file else None
         hdr_output_file = Path(plan.hdr_output_file) if plan.hdr_output_file else None
-        return Rendered(_buffers(plan, evidence), output_file, hdr_output_file, plan.tonemap)
+        return Rendered(_buffers(plan, arrays), output_file, hdr_output_file, plan.tonemap)
 
     failure: Exception | None = None
 
@@ -165,7 +165,7 @@ def drive(
         session.save_checkpoint()
         if on_checkpoint is not None and failure is None and not session.done:
             try:
-                on_checkpoint(rendered(session.evidence()))
+                on_checkpoint(rendered(session.buffers()))
             except Exception as error:
                 failure = error
                 _LOG.warning("the preview failed, the render goes on without: %s", error)
@@ -179,11 +179,11 @@ def drive(
         raise KeyboardInterrupt
     if failure is not None:
         raise failure
-    return rendered(session.take_evidence())
+    return rendered(session.take_buffers())
 
 
 def render_to_folder(arguments: Sequence[str]) -> int:
-    """Serve `render` inside the native command: render, and leave the evidence in a folder.
+    """Serve `render` inside the native command: render, and leave the buffers in a folder.
 
     The arguments are the command's private flag, the folder, a file descriptor for progress, the scene and
     the options as JSON. Returns the exit status.
@@ -202,7 +202,7 @@ def render_to_folder(arguments: Sequence[str]) -> int:
     arrays: dict[str, Any] = {
         f"{name}.{plane}": array for name, buffer in buffers.quantities() for plane, array in buffer.planes()
     }
-    np.savez(Path(folder, "evidence.npz"), spp=np.asarray(buffers.spp), **arrays)
+    np.savez(Path(folder, "buffers.npz"), spp=np.asarray(buffers.spp), **arrays)
     Path(folder, "attributes").write_text(json.dumps(buffers.attributes))
     return 0
 
@@ -243,7 +243,7 @@ def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) ->
             raise InputError(
                 error.read_text() if error.exists() else f"{scene}: Tungsten ended with status {status}"
             )
-        with np.load(Path(folder, "evidence.npz")) as arrays:
+        with np.load(Path(folder, "buffers.npz")) as arrays:
             buffers: dict[str, Any] = {
                 name: Buffer(**{plane: arrays[f"{name}.{plane}"] for plane in _planes(arrays.files, name)})
                 for name in CHANNELS
@@ -330,7 +330,7 @@ def _resume(session: Any, scene: Path) -> None:
     if resumed:
         _LOG.info("resuming at %d spp", session.current_spp)
     else:
-        _LOG.info("no saved state of this scene with evidence: starting at 0 spp")
+        _LOG.info("no saved state of this scene with all buffers: starting at 0 spp")
 
 
 @contextmanager
@@ -357,9 +357,9 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
 
 
-def _buffers(plan: Any, evidence: Evidence) -> RenderBuffers:
-    spp = evidence["spp"]
-    planes = {name: dict(evidence[name]) for name in CHANNELS if name in evidence}
+def _buffers(plan: Any, arrays: _Arrays) -> RenderBuffers:
+    spp = arrays["spp"]
+    planes = {name: dict(arrays[name]) for name in CHANNELS if name in arrays}
     if np.max(spp) < 2 and plan.writes_features:
         # The second half is empty and the variance is zero: neither says anything.
         _LOG.warning("1 sample per pixel has no halves and no variance; render at least 2")

@@ -54,8 +54,8 @@ void parallel_ranges(std::uint32_t items, const F& f) {
                              static_cast<std::uint32_t>(items * (share + 1) / shares));
 }
 
-// Owns what an Evidence points into: buffers moved out of the camera, and arrays of our own.
-class EvidenceMemory {
+// Owns what RenderBuffers point into: buffers moved out of the camera, and arrays of our own.
+class BufferMemory {
   public:
     float* own(std::vector<float> array) {
         arrays_.push_back(std::move(array));
@@ -84,19 +84,19 @@ std::vector<std::vector<float>> means_for(const Camera& camera, bool features) {
     return means;
 }
 
-Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, std::vector<std::vector<float>> means,
-                     bool take) {
-    const auto owner = std::make_shared<EvidenceMemory>();
-    EvidenceMemory& memory = *owner;
+RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
+                         std::vector<std::vector<float>> means, bool take) {
+    const auto owner = std::make_shared<BufferMemory>();
+    BufferMemory& memory = *owner;
     const Vec2u size = camera.resolution();
     const std::uint32_t width = size.x();
     const std::uint32_t pixels = size.product();
-    Evidence evidence{.width = static_cast<int>(width),
-                      .height = static_cast<int>(size.y()),
-                      .quantities = {},
-                      .spp = nullptr,
-                      .uniform_spp = static_cast<float>(spp),
-                      .memory = owner};
+    RenderBuffers buffers{.width = static_cast<int>(width),
+                          .height = static_cast<int>(size.y()),
+                          .quantities = {},
+                          .spp = nullptr,
+                          .uniform_spp = static_cast<float>(spp),
+                          .memory = owner};
 
     if (!features) {
         // Light also arrives by splatting, which no half knows of: only the whole image is sound.
@@ -108,8 +108,8 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, std::vect
                 std::copy_n(radiance.data(), 3, mean + std::size_t{i} * 3);
             }
         });
-        evidence.quantities.push_back({.name = "color", .channels = 3, .mean = mean});
-        return evidence;
+        buffers.quantities.push_back({.name = "color", .channels = 3, .mean = mean});
+        return buffers;
     }
 
     auto mean = means.begin();
@@ -131,19 +131,19 @@ Evidence evidence_of(Camera& camera, std::uint32_t spp, bool features, std::vect
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
             combine(blocks, channels, begin, end, quantity.mean, quantity.variance);
         });
-        evidence.quantities.push_back(quantity);
+        buffers.quantities.push_back(quantity);
 
         if (type == OutputColor) {
             const std::uint32_t* first = blocks.counts;
             const std::uint32_t* last = first + pixels;
-            evidence.uniform_spp = static_cast<float>(*first);
+            buffers.uniform_spp = static_cast<float>(*first);
             if (std::find_if(first, last, [=](std::uint32_t count) { return count != *first; }) != last) {
-                evidence.spp = memory.own({first, last});
+                buffers.spp = memory.own({first, last});
             }
         }
         if (take) memory.own(std::move(buffer));
     });
-    return evidence;
+    return buffers;
 }
 
 }  // namespace tungsten_dip
