@@ -14,7 +14,7 @@ from tungsten_dip.buffers import (
     Buffer,
     FloatImage,
     RenderBuffers,
-    halves_independent,
+    compare_halves,
     prefilter_features,
     sanitize,
 )
@@ -175,27 +175,27 @@ def test_every_size_passes_through_everything(shape: tuple[int, int], make_rende
     assert filtered.depth is not None
     np.testing.assert_array_equal(filtered.depth.mean, buffers.depth.mean)
     assert filtered.depth.halves is None
-    assert halves_independent(buffers).independent == (shape == (65, 67))
+    assert compare_halves(buffers).independent == (shape == (65, 67))
 
 
 def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
-    independent = halves_independent(_noisy_color(96, 80))
+    independent = compare_halves(_noisy_color(96, 80))
     assert independent.independent
     assert abs(independent.correlation) < 0.1
     assert independent.variance_ratio == pytest.approx(1, abs=0.1)
     assert independent.pixels_used >= 96 * 80 / 3
 
-    mirrored = halves_independent(_noisy_color(96, 80, mirror=0.5))
+    mirrored = compare_halves(_noisy_color(96, 80, mirror=0.5))
     assert not mirrored.independent
     assert mirrored.correlation == pytest.approx(-0.5, abs=0.1)
 
     color = _noisy_color(96, 80).color
-    copied = halves_independent(
+    copied = compare_halves(
         RenderBuffers(color=Buffer(color.mean, color.half_a, color.half_a, color.variance))
     )
     assert (copied.independent, copied.correlation) == (False, 1.0)
 
-    alone = halves_independent(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
+    alone = compare_halves(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
     assert (alone.independent, alone.pixels_used) == (False, 0)
 
 
@@ -238,7 +238,7 @@ def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     buffers = make_render(height=71, width=133).buffers
     one, many = prefilter_features(buffers, threads=1), prefilter_features(buffers, threads=5)
     assert _frozen_bytes(one) == _frozen_bytes(many)
-    assert halves_independent(buffers, 1).correlation == halves_independent(buffers, 5).correlation
+    assert compare_halves(buffers, 1).correlation == compare_halves(buffers, 5).correlation
     assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
 
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 
 from conftest import synthetic_render
 from hard_cases import CASES, HardCase, broken_renders, exposed, healthy, measure
-from tungsten_dip.buffers import RenderBuffers, halves_independent, prefilter_features, sanitize
+from tungsten_dip.buffers import RenderBuffers, compare_halves, prefilter_features, sanitize
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.onnx import infer
 
@@ -83,7 +83,7 @@ def test_exposure_is_undone(exponent: int, undamaged: FitResult) -> None:
 def test_halves_are_tested_alike_at_any_exposure(exponent: int) -> None:
     (case,) = (case for case in CASES if case.name == "halves correlated, +0.5")
     buffers = case.make().buffers
-    here, there = halves_independent(buffers), halves_independent(exposed(buffers, exponent))
+    here, there = compare_halves(buffers), compare_halves(exposed(buffers, exponent))
     assert here.variance_ratio == there.variance_ratio
     assert here.correlation == pytest.approx(there.correlation)
     assert not here.independent

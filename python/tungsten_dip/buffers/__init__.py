@@ -1,7 +1,7 @@
 """Buffers of a render: the data model, files, sanitising, checks of half buffers, pre-filtering."""
 
 from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
-from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent
+from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, RenderBuffers
@@ -19,7 +19,7 @@ __all__ = [
     "HalvesTest",
     "RenderBuffers",
     "check_writable",
-    "halves_independent",
+    "compare_halves",
     "prefilter_features",
     "read_buffers",
     "read_image",

@@ -9,7 +9,7 @@ from tungsten_dip._core import HalvesTest
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-__all__ = ["HalvesTest", "halves_independent", "without_foreign_halves"]
+__all__ = ["HalvesTest", "compare_halves", "without_foreign_halves"]
 
 _UNEQUAL = 0.5
 """How far a pixel may lie from (A + B) / 2, in units of |A - B| / 2: of one and two samples it is 1/3."""
@@ -23,7 +23,7 @@ _FOREIGN_SHARE = 0.05
 _ENOUGH_PIXELS = 1 << 14
 
 
-def halves_independent(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
+def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
     """Test whether the noise of the colour's halves is independent, as scoring one by the other assumes.
 
     Halves of a low-discrepancy sampler mirror each other (Tungsten's Sobol sampler: correlation -0.2), and

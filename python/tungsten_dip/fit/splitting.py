@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.half_buffers import HalvesTest, halves_independent
+from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
 from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import noise_in
 from tungsten_dip.cores import thread_count
@@ -70,7 +70,7 @@ def with_independent_halves(
     the noise of both halves. The same image and seed give the same halves, whatever the exposure.
     """
     color = buffers.color
-    test = halves_independent(buffers, threads)
+    test = compare_halves(buffers, threads)
     # Tiny or uniform images cannot be tested: their halves are used unless they are copies.
     untestable = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
     if test.independent or untestable:
