@@ -297,13 +297,13 @@ def test_half_never_turns_into_infinity(tmp_path: Path, caplog: pytest.LogCaptur
     buffers = RenderBuffers(Buffer(noise((2, 3, 3))))
     fits, bright = result_for(buffers), result_for(buffers, scale=1e6)
     fits.color[0, 0] = np.inf, 65504, np.nan
-    write_denoised(tmp_path / "a.exr", fits, buffers, half=True)
+    write_denoised(tmp_path / "a.exr", fits, buffers, float16=True)
     channels = load(tmp_path / "a.exr")[0][1]
     assert channels["R"].dtype == channels["error.Y"].dtype == np.float16
     assert channels["G"][0, 0] == 65504
     assert channels["color.R"].dtype == np.float32
     assert not caplog.text
-    write_denoised(tmp_path / "a.exr", bright, buffers, half=True)
+    write_denoised(tmp_path / "a.exr", bright, buffers, float16=True)
     channels = load(tmp_path / "a.exr")[0][1]
     assert same_bits(channels["R"], bright.color[..., 0].copy())
     assert channels["error.Y"].dtype == np.float16

@@ -2,7 +2,7 @@
 
 A denoised EXR holds, in one file:
 
-- R, G, B (and A) at the top level: the denoised picture, float32 or half;
+- R, G, B (and A) at the top level: the denoised picture, float32 or float16;
 - layer ``error``: the estimated squared relative error of every pixel, where known;
 - every channel of the input bit for bit, in its own pixel type. Input channels whose names are taken (in
   upper or lower case, and a grey picture's) move to the layer ``noisy``; the parts of a multi-part input
@@ -31,7 +31,7 @@ from tungsten_dip.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 
-LARGEST_HALF = 65504.0
+LARGEST_FLOAT16 = 65504.0
 
 _DENOISED_PART = "tungsten_dip denoised"
 
@@ -69,10 +69,10 @@ class Denoised(Protocol):
         """The mean of ``error``."""
 
 
-def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, half: bool = False) -> None:
+def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, float16: bool = False) -> None:
     """Write the denoised picture together with the buffers it was made from (see the top of this file).
 
-    With ``half``, the picture and the error are stored as 16 bit floats, except where that would turn a
+    With ``float16``, the picture and the error are stored as 16 bit floats, except where that would turn a
     value beyond 65504 into infinity. Settings, seed, seconds, iterations, the estimated relMSE and the
     version become attributes.
 
@@ -88,9 +88,9 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, h
             f"give those that it was made from"
         )
     source = buffers.source or _source_from_buffers(buffers)
-    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", result.color, half))
+    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", result.color, float16))
     if result.error is not None:
-        added |= _channels("error.", "Y", _stored("the error", result.error, half))
+        added |= _channels("error.", "Y", _stored("the error", result.error, float16))
     single = len(source.parts) == 1
     kept = source.parts[0].channels if single else {}
     if buffers.alpha is not None and "A" not in kept:
@@ -180,12 +180,12 @@ def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
     return {prefix + name: image[..., index] for index, name in enumerate(names)}
 
 
-def _stored(label: str, image: FloatImage, half: bool) -> Channel:
-    if not half:
+def _stored(label: str, image: FloatImage, float16: bool) -> Channel:
+    if not float16:
         return image
-    if np.any(np.isfinite(image) & (np.abs(image) > LARGEST_HALF)):
+    if np.any(np.isfinite(image) & (np.abs(image) > LARGEST_FLOAT16)):
         _LOG.warning(
-            "%s has values beyond %g, the largest half float: stored as float32", label, LARGEST_HALF
+            "%s has values beyond %g, the largest 16-bit float: stored as float32", label, LARGEST_FLOAT16
         )
         return image
     return image.astype(np.float16)

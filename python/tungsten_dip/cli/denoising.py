@@ -41,7 +41,7 @@ def add_file_options(parser: argparse._ActionsContainer) -> None:
     """Add how buffers are read and their results are written."""
     add = parser.add_argument
     add("--map", metavar="NAME=CHANNEL", type=_name_and_channel, action="append", default=[], help=MAP_HELP)
-    add("--half", action="store_true", help="write 16-bit floats")
+    add("--half", dest="float16", action="store_true", help="write 16-bit floats")
 
 
 def fit_settings(

@@ -95,7 +95,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
-    run = Run(settings, options.refit, dict(options.map), options.half, digest)
+    run = Run(settings, options.refit, dict(options.map), options.float16, digest)
     models = Models(first=warm_start)
 
     with _without_repetition(), progress_on_stderr("denoising") as progress:

@@ -199,7 +199,7 @@ def _denoised(
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, dict(options.map))
         result = denoise(buffers)
-    write_denoised(options.output, result, buffers, half=options.half)
+    write_denoised(options.output, result, buffers, float16=options.float16)
     if options.report is not None:
         write_report(options.report, options.input.name, buffers, result, DEFAULT_TONEMAP, remarks)
     if options.error_map is not None:

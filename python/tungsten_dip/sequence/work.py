@@ -37,14 +37,14 @@ _NOT_OF_THE_IMAGE = ("threads", "device")
 class Run:
     """What holds for all frames of a run.
 
-    ``half`` stores pictures as 16-bit floats. ``warm_start`` is the SHA-256 of the file of the model that the
-    first frame starts from, if any.
+    ``float16`` stores pictures as 16-bit floats. ``warm_start`` is the SHA-256 of the file of the model that
+    the first frame starts from, if any.
     """
 
     settings: FitSettings = field(default_factory=FitSettings)
     refit: Refit = "auto"
     mapping: dict[str, str] = field(default_factory=dict)
-    half: bool = False
+    float16: bool = False
     warm_start: str | None = None
 
 
@@ -149,7 +149,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, beside: bool, progress:
     )
     attributes = {**buffers.attributes, _RECORD: json.dumps({"key": key, **asdict(record)})}
     frame.output.parent.mkdir(parents=True, exist_ok=True)
-    write_denoised(frame.output, result, replace(buffers, attributes=attributes), half=run.half)
+    write_denoised(frame.output, result, replace(buffers, attributes=attributes), float16=run.float16)
     return record
 
 
@@ -171,6 +171,6 @@ def _key(frame: Frame, run: Run) -> str:
     except OSError as error:
         raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
     settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
-    asked = (settings, run.refit, run.mapping, run.half, run.warm_start)
+    asked = (settings, run.refit, run.mapping, run.float16, run.warm_start)
     facts: list[Any] = [stats, *asked, metadata.version("tungsten-dip")]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
