@@ -1,4 +1,4 @@
-"""Denoise path-traced images with a deep image prior guided by feature buffers; no training data needed.
+"""Denoise path-traced images with a small network fitted to each image alone; no training data needed.
 
 The public names are all here and load on first use: importing the package loads neither torch nor a renderer.
 

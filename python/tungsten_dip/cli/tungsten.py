@@ -149,7 +149,9 @@ def _parser() -> argparse.ArgumentParser:
     hosts = ("auto", "tungsten", "mitsuba")
     add("--host", choices=hosts, default="auto", help="who renders (auto: Tungsten if it was built in)")
     dip = parser.add_argument_group("denoising")
-    dip.add_argument("--dip-denoise", action="store_true", help="denoise the picture with a deep image prior")
+    dip.add_argument(
+        "--dip-denoise", action="store_true", help="denoise the picture with a network fitted to it"
+    )
     add_fit_options(dip, prefix="dip-")
     dip.add_argument(
         "--dip-preview",
