@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
+from tungsten_dip.buffers.display import ldr_from_feature
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene
@@ -110,8 +109,9 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) ->
         for plane, path in _files_of(request):
             array: FloatImage | None = getattr(getattr(buffers, request.type), plane, None)
             if array is not None:
-                is_ldr = path.suffix.lower() in _LDR
-                write_image(path, _displayed_buffer(array, request.type, plane) if is_ldr else array)
+                if path.suffix.lower() in _LDR and plane != "variance":
+                    array = ldr_from_feature(request.type, array)
+                write_image(path, array)
             elif path.is_file():
                 path.unlink()
                 outdated.append(path.name)
@@ -125,15 +125,6 @@ def _files_of(request: OutputBuffer) -> Iterator[tuple[str, Path]]:
         if {"mean": True, "variance": request.sample_variance}.get(plane, request.two_buffer_variance):
             for path in map(Path, filter(None, (request.hdr_output_file, request.ldr_output_file))):
                 yield plane, path.with_name(path.stem + suffix + path.suffix)
-
-
-def _displayed_buffer(array: FloatImage, quantity: str, plane: str) -> FloatImage:
-    """Scale a buffer for the eye as Tungsten's ``OutputBuffer::saveLdr``: normals and depth to [0, 1]."""
-    if plane == "variance" or quantity not in ("normal", "depth"):
-        return array
-    if quantity == "normal":
-        return array * np.float32(0.5) + np.float32(0.5)
-    return array / np.float32(array.max(initial=0) or 1)
 
 
 def _path(name: str) -> Path | None:

@@ -8,8 +8,8 @@ from dataclasses import asdict
 
 import numpy as np
 
-from tungsten_dip.buffers.display import ldr_from_radiance
-from tungsten_dip.buffers.model import FEATURES, FloatImage, RenderBuffers
+from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
+from tungsten_dip.buffers.model import FEATURES, RenderBuffers
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, HistoryPoint
 from tungsten_dip.report import html
 from tungsten_dip.report.html import Picture
@@ -53,7 +53,7 @@ def report_page(
 
 
 def _features(buffers: RenderBuffers) -> Iterator[Picture]:
-    """Yield the means of the features: normals as (n + 1) / 2, depth divided by its 99th percentile.
+    """Yield the means of the features for the eye: albedo with a gamma, depth up to its 99th percentile.
 
     The depth of the sky, which other renderers mark by a large number, is 0 as in Tungsten's.
     """
@@ -61,19 +61,11 @@ def _features(buffers: RenderBuffers) -> Iterator[Picture]:
         values = np.nan_to_num(buffer.mean)
         if name == "color":
             continue
-        if name == "albedo":
-            values = ldr_from_radiance(values)
-        elif name == "normal":
-            values = np.float32(0.5) * (values + 1)
-        elif name == "depth":
+        if name == "depth":
             values = np.where(values < _SKY_DEPTH, values, np.float32(0))
-            values = values / (np.percentile(values, 99) or 1)
-        yield Picture(name, _in_range(values))
-
-
-def _in_range(values: FloatImage) -> FloatImage:
-    rgb = np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3))
-    return np.ascontiguousarray(rgb, dtype=np.float32)
+            values = np.minimum(values, np.float32(np.percentile(values, 99) or np.inf))
+        ldr = ldr_from_radiance(values) if name == "albedo" else ldr_from_feature(name, values)
+        yield Picture(name, np.ascontiguousarray(np.broadcast_to(ldr, (*values.shape[:2], 3))))
 
 
 def _subtitle(buffers: RenderBuffers) -> str:

@@ -1,8 +1,7 @@
 """Inputs and training targets of the published method: images in [0, 1], as in Tungsten's PNGs.
 
-Tungsten writes (`OutputBuffer::saveLdr`) normals as (n + 1) / 2, depth divided by its largest value, albedo
-and every variance as they are, all clipped to [0, 1]. Grey images are read as three equal channels. Here
-nothing is rounded to 8 bits, and colour is tone-mapped with gamma 2.2.
+Features are those of `buffers.display`, variances are clipped to [0, 1]. Grey images are read as three equal
+channels. Here nothing is rounded to 8 bits, and colour is tone-mapped with gamma 2.2.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tungsten_dip.buffers.display import ldr_from_radiance
+from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
@@ -85,7 +84,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
         if missing:
             notes.append(f"{quantity}: no {', '.join(missing)}, used without")
         if buffer is not None:
-            features |= _ldr_from_feature(quantity, buffer)
+            features |= _ldr_planes(quantity, buffer)
 
     stack = np.concatenate([color[:, :, :0], *features.values()], axis=2)
     names = [f"{name} {channel}" for name in features for channel in range(3)]
@@ -108,13 +107,10 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     return PaperImages(stack, tuple(names), random_channels, color, tuple(notes))
 
 
-def _ldr_from_feature(quantity: str, buffer: Buffer) -> dict[str, FloatImage]:
+def _ldr_planes(quantity: str, buffer: Buffer) -> dict[str, FloatImage]:
     """Return every plane that a feature has as three channels in [0, 1]."""
     images = {}
     for plane, values in buffer.planes():
-        if plane != "variance" and quantity == "normal":
-            values = np.float32(0.5) * (values + 1)
-        elif plane != "variance" and quantity == "depth":
-            values = values / max(values.max(initial=0, where=np.isfinite(values)), np.finfo(np.float32).tiny)
-        images[f"{quantity} {plane}"] = np.broadcast_to(np.clip(values, 0, 1), (*values.shape[:2], 3))
+        ldr = np.clip(values, 0, 1) if plane == "variance" else ldr_from_feature(quantity, values)
+        images[f"{quantity} {plane}"] = np.broadcast_to(ldr, (*values.shape[:2], 3))
     return images
