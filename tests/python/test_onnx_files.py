@@ -15,7 +15,7 @@ from tungsten_dip.fit.evidence import Layout
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
 from tungsten_dip.fit.planes import Standardisation
-from tungsten_dip.fit.training import first_weights
+from tungsten_dip.fit.pointwise import first_weights
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.onnx.file import proto_from_model

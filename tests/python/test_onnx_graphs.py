@@ -20,8 +20,7 @@ from tungsten_dip.fit.evidence import Layout
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
 from tungsten_dip.fit.planes import Standardisation
-from tungsten_dip.fit.pointwise import Examples
-from tungsten_dip.fit.training import first_weights
+from tungsten_dip.fit.pointwise import Examples, first_weights
 from tungsten_dip.onnx import infer, inference
 from tungsten_dip.onnx.file import proto_from_model
 

@@ -16,8 +16,8 @@ from tungsten_dip.fit.evidence import Layout
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots import Pilot
 from tungsten_dip.fit.planes import PLANES_RADIUS, network_inputs, planes_of_half
-from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, training_step, weight_shapes
-from tungsten_dip.fit.training import first_weights, start_of_training
+from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights, training_step, weight_shapes
+from tungsten_dip.fit.training import start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx import infer
 

@@ -11,6 +11,7 @@ once. The number of pixels is free.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ import numpy as np
 import onnx
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage
-from tungsten_dip.fit.evidence import Indices
+from tungsten_dip.fit.evidence import Indices, Layout
 from tungsten_dip.fit.model import Weights, check_finite
 from tungsten_dip.graphs.builder import GraphBuilder
 from tungsten_dip.graphs.sessions import Device, session_from_proto
@@ -27,6 +28,9 @@ HIDDEN = 16
 LEAKY_SLOPE = 0.2
 ADAM_BETAS = (0.9, 0.999)
 ADAM_EPSILON = 1e-8
+
+_HEAD_START = 1.0
+"""Logit that the best single pilot starts with."""
 
 _RUN_PIXELS = 1 << 14
 """Pixels that the network processes at once: the outputs of its layers stay in the processor's cache."""
@@ -95,6 +99,23 @@ def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
         shapes[f"layer{layer}.weight"] = (sizes[layer], sizes[layer - 1])
         shapes[f"layer{layer}.bias"] = (sizes[layer],)
     return shapes
+
+
+def first_weights(layout: Layout, seed: int, members: int) -> Weights:
+    """Return the weights that untrained members start from (He et al. 2015, uniform)."""
+    rng = np.random.default_rng(seed)
+    weights: Weights = {}
+    for name, (outputs, *inputs) in weight_shapes(len(layout.planes), layout.choices).items():
+        if inputs:
+            bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs[0]))
+            shape = (members * outputs, *inputs, 1, 1)
+            weights[name] = rng.uniform(-bound, bound, shape).astype(np.float32)
+        else:
+            weights[name] = np.zeros(members * outputs, np.float32)
+    # Starts from the mean of the pilots that the head start gives, whatever the seed.
+    weights["layer3.weight"][:] = 0
+    weights["layer3.bias"][layout.reference :: layout.choices] = _HEAD_START
+    return weights
 
 
 class PointwiseNetwork:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
 from tungsten_dip.buffers.model import FloatArray
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.evidence import Evidence, Indices, Layout, with_best_reference
+from tungsten_dip.fit.evidence import Evidence, Indices, with_best_reference
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.outcome import estimate_error, held_out_error
 from tungsten_dip.fit.planes import (
@@ -22,14 +21,11 @@ from tungsten_dip.fit.planes import (
     network_inputs,
     standardisation_of,
 )
-from tungsten_dip.fit.pointwise import HIDDEN, LEAKY_SLOPE, Examples, PointwiseNetwork
+from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights
 from tungsten_dip.fit.settings import FitSettings, HistoryPoint
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2
-_HEAD_START = 1.0
-"""Logit that the best single pilot starts with."""
-
 _WARM_UP_STEPS = 10
 _POOL_PIXELS = 1 << 17
 _POOL_PASSES = 4
@@ -118,22 +114,6 @@ def _start(
     examples = Examples(inputs.reshape(2 * pixels, -1), pilots.reshape(2 * pixels, -1, 3), target, weight)
     evidence = replace(evidence, pilots=views, features=({}, {}))
     return Start(evidence, examples, standardisation, weights, warm, notes)
-
-
-def first_weights(layout: Layout, seed: int, members: int) -> Weights:
-    """Return the weights that untrained networks start from (He et al. 2015, uniform)."""
-    rng = np.random.default_rng(seed)
-    sizes = (len(layout.planes), HIDDEN, HIDDEN, layout.choices)
-    weights: Weights = {}
-    for layer, (inputs, outputs) in enumerate(pairwise(sizes), start=1):
-        bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs))
-        shape = (members * outputs, inputs, 1, 1)
-        weights[f"layer{layer}.weight"] = rng.uniform(-bound, bound, shape).astype(np.float32)
-        weights[f"layer{layer}.bias"] = np.zeros(members * outputs, np.float32)
-    # Starts from the mean of the pilots that the head start gives, whatever the seed.
-    weights["layer3.weight"][:] = 0
-    weights["layer3.bias"][layout.reference :: layout.choices] = _HEAD_START
-    return weights
 
 
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
