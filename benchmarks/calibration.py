@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.bench.sets import BenchSet, read_sets
+from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise
-from tungsten_dip.report.metrics import relative_squared_error
 from tungsten_dip.report.preview import block_means
 
 BLOCK = 8

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
     from tungsten_dip.fit.model import Model
-    from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+    from tungsten_dip.fit.result import FitResult, HistoryPoint
+    from tungsten_dip.fit.settings import FitSettings
     from tungsten_dip.hosts import render
     from tungsten_dip.onnx import infer, load_model, save_model
     from tungsten_dip.report.metrics import Comparison, compare
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
 _MODULE_BY_NAME = {
     "Buffer": "buffers.model",
     "Comparison": "report.metrics",
-    "FitResult": "fit.settings",
+    "FitResult": "fit.result",
     "FitSettings": "fit.settings",
-    "HistoryPoint": "fit.settings",
+    "HistoryPoint": "fit.result",
     "InputError": "errors",
     "Model": "fit.model",
     "RenderBuffers": "buffers.model",

@@ -13,10 +13,10 @@ import pytest
 
 from fitted_models import DRAFT
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.fit import FitResult, denoise
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx import save_model
-from tungsten_dip.report.metrics import relative_squared_error
 
 SAMPLE_SHAPE = 0.5
 """Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""

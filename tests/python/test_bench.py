@@ -23,7 +23,8 @@ from tungsten_dip.bench.table import Row, SetRows, markdown_table
 from tungsten_dip.buffers import RenderBuffers, read_image, write_image, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import silent
 from tungsten_dip.report.metrics import Comparison, compare
 

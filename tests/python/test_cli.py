@@ -20,7 +20,8 @@ from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes
-from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import silent
 from tungsten_dip.sequence.following import Followed

@@ -36,7 +36,8 @@ from tungsten_dip.buffers import (
 from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 
 Channels = dict[str, np.ndarray]
 

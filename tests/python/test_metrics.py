@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers.display import ldr_from_radiance
+from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.errors import InputError
-from tungsten_dip.report.metrics import compare, relative_squared_error
+from tungsten_dip.report.metrics import compare
 
 
 @pytest.fixture

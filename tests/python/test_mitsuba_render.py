@@ -17,7 +17,8 @@ import pytest
 from tungsten_dip.buffers import read_buffers, write_denoised
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.hosts.mitsuba.render import _scene_with_integrator, _Statistics, render_translated
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene

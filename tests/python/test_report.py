@@ -6,7 +6,8 @@ import pytest
 
 from browser import assert_page_works
 from tungsten_dip.buffers import Buffer, RenderBuffers
-from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.report.page import _features, _round_ticks, report_page
 from tungsten_dip.report.preview import FALSE_COLORS, GAP_PX, block_means, error_in_false_color, side_by_side
 

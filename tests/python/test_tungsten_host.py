@@ -19,7 +19,7 @@ from tungsten_dip import hosts
 from tungsten_dip.buffers import read_image, write_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitResult
+from tungsten_dip.fit.result import FitResult
 from tungsten_dip.hosts import memory, tungsten
 from tungsten_dip.scene import load_scene
 

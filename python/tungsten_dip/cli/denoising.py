@@ -12,7 +12,8 @@ from tungsten_dip.buffers import RenderBuffers, write_text
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, check_settings
-from tungsten_dip.fit.settings import FitResult, FitSettings, Preset
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.interrupts import held_interrupts
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")

@@ -46,7 +46,8 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import PAPER_SETTINGS, FitResult, FitSettings, Inputs, Preset
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs, Preset
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 

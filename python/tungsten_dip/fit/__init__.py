@@ -10,7 +10,8 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.preparation import finished, prepared
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress, silent
 

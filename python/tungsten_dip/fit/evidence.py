@@ -12,6 +12,7 @@ import numpy.typing as npt
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.clock import Clock
@@ -30,7 +31,7 @@ from tungsten_dip.fit.pilots import (
     following_guides,
     guidance_of_halves,
 )
-from tungsten_dip.fit.settings import RELMSE_EPSILON, FitSettings
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.progress import Progress
 

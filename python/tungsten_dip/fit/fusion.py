@@ -30,7 +30,8 @@ from tungsten_dip.fit.pilots import (
     Pilot,
 )
 from tungsten_dip.fit.pointwise import PointwiseNetwork
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.fit.training import Start, Training, start_of_training, train
 from tungsten_dip.progress import Progress

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage, Halves
-from tungsten_dip.fit.settings import RELMSE_EPSILON
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 
 _Floats = npt.NDArray[np.float64]
 

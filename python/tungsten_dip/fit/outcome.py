@@ -10,13 +10,15 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.exposure import exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_lost_detail
-from tungsten_dip.fit.settings import RELMSE_EPSILON, FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
 
 _ERROR_RADIUS = 4
 _CHUNK_PIXELS = 1 << 18

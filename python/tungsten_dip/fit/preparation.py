@@ -13,7 +13,7 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.candidates import checked_candidates, checked_previous
-from tungsten_dip.fit.settings import FitResult
+from tungsten_dip.fit.result import FitResult
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,22 +1,15 @@
-"""The settings of a fit, and its result."""
+"""The settings of a fit."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Literal, get_args, get_origin, get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
-from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.errors import InputError
-
-if TYPE_CHECKING:
-    from tungsten_dip.fit.model import Model
 
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
-
-RELMSE_EPSILON = 0.01
-"""Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""
 
 PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 """What the preset ``paper`` alone leaves open."""
@@ -90,41 +83,3 @@ class FitSettings:
 
 def _is_whole(value: object, least: int, most: int) -> bool:
     return isinstance(value, Integral) and least <= int(value) <= most
-
-
-@dataclass(frozen=True)
-class HistoryPoint:
-    """A point of a fit: the time and steps so far, and the estimated error."""
-
-    seconds: float
-    iteration: int
-    estimated_relmse: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """A denoised image, its estimated error, and the fitted network.
-
-    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is its estimated
-    relMSE (with epsilon 0.01), and ``error`` the estimated relative squared error around every pixel, shape
-    (height, width, 1), the mean over 9x9 pixels. ``halves`` are the results of half A of the samples alone
-    and of half B alone, in the units and shape of ``color``, which is their mean with the preset draft, and
-    with the others moved from it towards the pilots of all samples. These are None with the preset paper.
-    ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it
-    (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
-    ``interrupted`` indicates that Ctrl-C ended the fit early. ``notes`` are one line each, for example on
-    missing buffers.
-    """
-
-    color: FloatImage
-    settings: FitSettings
-    seconds: float
-    iterations: int
-    error: FloatImage | None = None
-    estimated_relmse: float | None = None
-    halves: Halves | None = None
-    halves_drawn: bool = False
-    model: Model | None = None
-    history: tuple[HistoryPoint, ...] = ()
-    interrupted: bool = False
-    notes: tuple[str, ...] = ()

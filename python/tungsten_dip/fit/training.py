@@ -22,7 +22,8 @@ from tungsten_dip.fit.planes import (
     standardisation_of,
 )
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights
-from tungsten_dip.fit.settings import FitSettings, HistoryPoint
+from tungsten_dip.fit.result import HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2

@@ -20,7 +20,8 @@ from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import finished, prepared
 from tungsten_dip.fit.published.images import network_input, paper_images
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import requirement
-from tungsten_dip.fit.settings import RELMSE_EPSILON
 
 _LOG = logging.getLogger(__name__)
 
@@ -85,12 +84,6 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
         nonfinite=int(finite.size - np.count_nonzero(finite)),
         mean_ratio=float(x.mean(dtype=np.float64)) / reference_mean if reference_mean > 0 else None,
     )
-
-
-def relative_squared_error(image: FloatImage, reference: FloatImage) -> npt.NDArray[np.float64]:
-    """Return (x - r)^2 / (r^2 + 0.01) of every value, in the shape of the images; its mean is relMSE."""
-    x, r = image.astype(np.float64), reference.astype(np.float64)
-    return (x - r) ** 2 / (r**2 + RELMSE_EPSILON)
 
 
 def _psnr(x: FloatImage, r: FloatImage) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage, Halves
-from tungsten_dip.fit.settings import RELMSE_EPSILON
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 
 _SURE = 0.35
 """Relative standard error up to which the unbiased estimate is believed."""

@@ -22,7 +22,8 @@ from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.preparation import finished, prepared
-from tungsten_dip.fit.settings import FitResult, FitSettings
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.onnx.inference import infer_fusion
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera

@@ -22,7 +22,8 @@ from tungsten_dip.fit.published.constants import ITERATIONS
 from tungsten_dip.fit.published.device import compute_device, convolution_dtype
 from tungsten_dip.fit.published.images import PaperImages, network_input, paper_images
 from tungsten_dip.fit.published.networks import ResNet, Skip
-from tungsten_dip.fit.settings import FitResult, FitSettings, HistoryPoint
+from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
 # The numbers of the published notebook.
