@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from tungsten_dip.buffers.model import Quantity
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.render import QUANTITIES, render
 from tungsten_dip.scene.parse import load_scene
@@ -140,7 +141,7 @@ def write_strands(path: Path, count: int = 2000, points: int = 6) -> None:
     path.write_bytes(header + strands.astype("<f4").tobytes())
 
 
-def cpu_seconds(scene: Scene, quantities: tuple[str, ...] = QUANTITIES) -> float:
+def cpu_seconds(scene: Scene, quantities: tuple[Quantity, ...] = QUANTITIES) -> float:
     """Return the CPU time of one render."""
     start = time.process_time()
     render(scene, spp=SPP, quantities=quantities)

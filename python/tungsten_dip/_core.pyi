@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Quantity
 
 class Defects:
     """How many values of an image no renderer can have meant."""
@@ -41,7 +41,7 @@ class HalvesTest:
     def independent(self) -> bool: ...
 
 def sanitize(
-    quantity: str,
+    quantity: Quantity,
     mean: FloatImage,
     half_a: FloatImage | None,
     half_b: FloatImage | None,

@@ -11,8 +11,9 @@ import subprocess
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from tungsten_dip.buffers import FEATURES, FloatImage, RenderBuffers, read_image, write_tungsten_folder
+from tungsten_dip.buffers import FloatImage, RenderBuffers, read_image, write_tungsten_folder
 from tungsten_dip.errors import InputError
 
 
@@ -25,12 +26,12 @@ def nfor_image(buffers: RenderBuffers, denoiser: Path) -> FloatImage:
     """
     if buffers.color.halves is None or buffers.color.variance is None:
         raise InputError("NFOR: expected a colour with halves A and B and its variance; save them as well")
-    kept = {name: getattr(buffers, name) for name in FEATURES}
-    kept = {
-        name: buffer if buffer and buffer.halves and buffer.variance is not None else None
-        for name, buffer in kept.items()
+    left_out: dict[str, Any] = {
+        name: None
+        for name, buffer in buffers.quantities()
+        if buffer.halves is None or buffer.variance is None or name == "visibility"
     }
-    buffers = replace(buffers, **kept, visibility=None, alpha=None, spp=None)
+    buffers = replace(buffers, **left_out, alpha=None, spp=None)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_tungsten_folder(folder, buffers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Quantity
 
 _GAMMA = 2.2
 
@@ -19,7 +19,7 @@ def radiance_from_ldr(ldr: FloatArray) -> FloatArray:
     return ldr ** np.float32(_GAMMA)
 
 
-def ldr_from_feature(quantity: str, values: FloatImage) -> FloatImage:
+def ldr_from_feature(quantity: Quantity, values: FloatImage) -> FloatImage:
     """Return a feature's mean, or one of its halves, as Tungsten displays it (`OutputBuffer::saveLdr`).
 
     Values in [0, 1]: normals are (n + 1) / 2, depth is divided by its largest value, others are clipped.

@@ -43,14 +43,14 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
     Such halves were left by another render, or belong to another layer (such as light groups named A and B).
     Expects buffers as rendered: sanitising changes mean and halves, and repairs one from the other.
     """
-    foreign = [name for name, buffer in buffers.quantities() if not _halves_belong(buffer)]
-    alone: dict[str, Buffer | None] = {}
-    for name in foreign:
-        buffer: Buffer = getattr(buffers, name)
-        alone[name] = Buffer(buffer.mean, variance=buffer.variance)
+    alone: dict[str, Buffer | None] = {
+        name: Buffer(buffer.mean, variance=buffer.variance)
+        for name, buffer in buffers.quantities()
+        if not _halves_belong(buffer)
+    }
     lines = tuple(
         f"{name}: the half buffers are not used: their mean is not the image, so they are of another image"
-        for name in foreign
+        for name in alone
     )
     return buffers.with_quantities(**alone), lines
 

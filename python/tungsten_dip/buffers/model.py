@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,12 @@ Halves = tuple[FloatImage, FloatImage]
 FloatArray = npt.NDArray[np.float32]
 """Of any shape that is not an image's."""
 
-CHANNELS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
+Quantity = Literal["color", "albedo", "normal", "depth", "visibility"]
+
+CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
 """Channel count of every quantity a renderer may write."""
 
-FEATURES = ("albedo", "normal", "depth")
+FEATURES: tuple[Quantity, ...] = ("albedo", "normal", "depth")
 """The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
 
 
@@ -107,12 +109,17 @@ class RenderBuffers:
         """Columns."""
         return int(self.color.mean.shape[1])
 
-    def quantities(self) -> Iterator[tuple[str, Buffer]]:
+    def get(self, quantity: Quantity) -> Buffer | None:
+        """Return a quantity's buffer, None if it is not known."""
+        buffer: Buffer | None = getattr(self, quantity)
+        return buffer
+
+    def quantities(self) -> Iterator[tuple[Quantity, Buffer]]:
         """Yield (name, buffer) for colour and every feature that is known."""
-        for name in CHANNELS:
-            buffer = getattr(self, name)
+        for quantity in CHANNELS:
+            buffer = self.get(quantity)
             if buffer is not None:
-                yield name, buffer
+                yield quantity, buffer
 
     def with_quantities(self, **buffers: Buffer | None) -> RenderBuffers:
         """Return a copy with some quantities replaced, and without ``source``, which does not hold them."""

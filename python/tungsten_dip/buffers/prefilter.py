@@ -32,7 +32,7 @@ def prefilter_features(
     """
     filtered: dict[str, Buffer | None] = {}
     for name in FEATURES:
-        feature: Buffer | None = getattr(buffers, name)
+        feature = buffers.get(name)
         if feature is not None:
             mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
             if feature.halves is None:

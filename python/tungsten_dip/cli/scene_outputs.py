@@ -107,7 +107,7 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) ->
     outdated = []
     for request in outputs.buffers:
         for plane, path in _files_of(request):
-            array: FloatImage | None = getattr(getattr(buffers, request.type), plane, None)
+            array: FloatImage | None = getattr(buffers.get(request.type), plane, None)
             if array is not None:
                 if path.suffix.lower() in _LDR and plane != "variance":
                     array = ldr_from_feature(request.type, array)

@@ -376,7 +376,7 @@ def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImag
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
     """Return notes on missing features, if there are any."""
-    missing = [name for name in FEATURES if getattr(buffers, name) is None]
+    missing = [name for name in FEATURES if buffers.get(name) is None]
     if not missing:
         return ()
     replaced = "; alpha takes the albedo's place" if "albedo" in missing and buffers.alpha is not None else ""

@@ -54,7 +54,7 @@ def oidn_image(
         if feature is not None
     }
     repaired, _ = sanitize(RenderBuffers(color_buffer).with_quantities(**features), threads)
-    images = {name: buffer.mean for name, buffer in repaired.quantities()}
+    images: dict[str, FloatImage] = {name: buffer.mean for name, buffer in repaired.quantities()}
     images["output"] = np.empty_like(images["color"])
     qualities = {
         "fast": pyoidn.OIDN_QUALITY_FAST,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tungsten_dip.buffers.image_file import MAX_PIXELS
-from tungsten_dip.buffers.model import CHANNELS
+from tungsten_dip.buffers.model import CHANNELS, Quantity
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import Scene
 
@@ -31,7 +31,7 @@ def too_large(path: Path | str, size: str, most: int) -> InputError:
     )
 
 
-def check_fits_mitsuba(scene: Scene, quantities: Sequence[str]) -> None:
+def check_fits_mitsuba(scene: Scene, quantities: Sequence[Quantity]) -> None:
     """Raise InputError if Mitsuba cannot render these quantities of a scene with the memory available."""
     # Of every quantity both halves and the deviations come back, and a count (mitsuba_ext/tungsten_path.cpp).
     values = sum(3 * CHANNELS[name] + 1 for name in quantities)

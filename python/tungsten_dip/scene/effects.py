@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from tungsten_dip.buffers.model import Quantity
 from tungsten_dip.scene.types import (
     AtmosphericMedium,
     Bsdf,
-    BufferName,
     CheckerTexture,
     ConductorBsdf,
     ConstantTexture,
@@ -89,8 +89,8 @@ class Effects:
 class Decision:
     """Which buffers a fit learns from, colour first, and why each is or is not among them."""
 
-    buffers: tuple[BufferName, ...]
-    reasons: dict[BufferName, str]
+    buffers: tuple[Quantity, ...]
+    reasons: dict[Quantity, str]
 
 
 def effects_of(scene: Scene) -> Effects:
@@ -127,7 +127,7 @@ def effects_of(scene: Scene) -> Effects:
 def decision_of(scene: Scene) -> Decision:
     """Return which buffers of a scene a fit learns from."""
     left_out = _reasons_without_information(scene, effects_of(scene))
-    informative: dict[BufferName, str] = {
+    informative: dict[Quantity, str] = {
         "color": "the image itself",
         "albedo": "distinguishes surfaces of different colours",
         "normal": "distinguishes surfaces of different orientation",
@@ -182,9 +182,9 @@ def inspect_text(scene: Scene) -> str:
     return "\n".join(lines)
 
 
-def _reasons_without_information(scene: Scene, effects: Effects) -> dict[BufferName, str]:
+def _reasons_without_information(scene: Scene, effects: Effects) -> dict[Quantity, str]:
     """Return the features that would be constant, or as noisy as the image, with the reason."""
-    reasons: dict[BufferName, str] = {
+    reasons: dict[Quantity, str] = {
         "visibility": "one random shadow ray a sample: as noisy as the image that it would guide"
     }
     surfaces = [p for p in _primitives(scene) if not isinstance(p, (*_ENVIRONMENT, Point, Instances))]

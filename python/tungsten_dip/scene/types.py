@@ -19,6 +19,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.buffers.model import Quantity
+
 Vec3 = tuple[float, float, float]
 """A point, a direction or a linear RGB colour; a single number in the file means all three."""
 
@@ -52,7 +54,6 @@ Transform = Annotated[Matrix, Key("transform")]
 MicrofacetDistribution = Literal["beckmann", "phong", "ggx"]
 TonemapName = Literal["linear", "gamma", "reinhard", "filmic", "pbrt"]
 FilterName = Literal["dirac", "box", "tent", "gaussian", "mitchell_netravali", "catmull_rom", "lanczos"]
-BufferName = Literal["color", "depth", "normal", "albedo", "visibility"]
 
 
 def identity() -> Matrix:
@@ -941,7 +942,7 @@ class ReversibleJumpMlt(Integrator):
 class OutputBuffer:
     """A buffer that Tungsten is to write. Halves A and B come with ``two_buffer_variance``."""
 
-    type: BufferName
+    type: Quantity
     ldr_output_file: str = ""
     hdr_output_file: str = ""
     two_buffer_variance: bool = False

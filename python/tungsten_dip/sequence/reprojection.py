@@ -157,8 +157,10 @@ def _same_surface(
     same: npt.NDArray[np.bool_] = np.where(
         distance > 0, np.abs(found - distance) <= _DEPTH_TOLERANCE * distance, found == 0
     )
-    for name, tolerance in (("normal", _NORMAL_TOLERANCE), ("albedo", _ALBEDO_TOLERANCE)):
-        before, now = getattr(previous, name), getattr(current, name)
+    for before, now, tolerance in (
+        (previous.normal, current.normal, _NORMAL_TOLERANCE),
+        (previous.albedo, current.albedo, _ALBEDO_TOLERANCE),
+    ):
         if before is None or now is None:
             continue
         values = now.mean.reshape(-1, 3)[part]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 
@@ -20,8 +20,8 @@ RANDOM_CHANNELS = 3
 
 RANDOM_INPUT_SCALE = 0.1
 
-_QUANTITY_FROM_INPUTS = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
-_QUANTITIES = ("normal", "albedo", "depth")
+_QUANTITY_FROM_INPUTS: dict[str, Quantity] = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
+_QUANTITIES: tuple[Quantity, ...] = ("normal", "albedo", "depth")
 _PLANES = ("mean", "half_a", "half_b", "variance")
 
 
@@ -68,18 +68,18 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     random_channels = RANDOM_CHANNELS if settings.scheme == "ioc" or "random" in settings.inputs else 0
     notes = []
 
-    quantities: tuple[str, ...] = ()
+    quantities: tuple[Quantity, ...] = ()
     if settings.scheme == "ioc" or settings.inputs.startswith("all"):
         quantities = _QUANTITIES
     elif settings.inputs in _QUANTITY_FROM_INPUTS:
         quantities = (_QUANTITY_FROM_INPUTS[settings.inputs],)
-        if getattr(buffers, quantities[0]) is None:
+        if buffers.get(quantities[0]) is None:
             raise InputError(
                 f"inputs {settings.inputs}: expected a {quantities[0]} buffer, found none; "
                 f"render it, or use inputs all (what is there) or random"
             )
     for quantity in quantities:
-        buffer = getattr(buffers, quantity)
+        buffer = buffers.get(quantity)
         missing = _PLANES if buffer is None else [p for p in _PLANES if getattr(buffer, p) is None]
         if missing:
             notes.append(f"{quantity}: no {', '.join(missing)}, used without")
@@ -107,7 +107,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
     return PaperImages(stack, tuple(names), random_channels, color, tuple(notes))
 
 
-def _ldr_planes(quantity: str, buffer: Buffer) -> dict[str, FloatImage]:
+def _ldr_planes(quantity: Quantity, buffer: Buffer) -> dict[str, FloatImage]:
     """Return every plane that a feature has as three channels in [0, 1]."""
     images = {}
     for plane, values in buffer.planes():

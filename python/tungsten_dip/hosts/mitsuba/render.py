@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import check_fits_mitsuba
@@ -26,7 +26,7 @@ from tungsten_dip.scene.types import Scene
 
 _LOG = logging.getLogger(__name__)
 
-QUANTITIES = ("color", "albedo", "normal", "depth")
+QUANTITIES: tuple[Quantity, ...] = ("color", "albedo", "normal", "depth")
 """What is rendered unless something else is asked for; colour is always there."""
 
 _POLL_S = 0.1
@@ -48,7 +48,7 @@ def render(
     threads: int | None = None,
     timeout_s: float | None = None,
     progress: Progress = silent,
-    quantities: Sequence[str] = QUANTITIES,
+    quantities: Sequence[Quantity] = QUANTITIES,
 ) -> RenderBuffers:
     """Render a scene with ``spp`` samples per pixel (None: the scene's); writes no file.
 
@@ -88,7 +88,7 @@ def render_translated(
     timeout_s: float | None = None,
     spp_step: int = 16,
     progress: Progress = silent,
-    quantities: Sequence[str] = QUANTITIES,
+    quantities: Sequence[Quantity] = QUANTITIES,
 ) -> RenderBuffers:
     """Render a translated scene; `render` says what comes back and what is raised.
 
@@ -111,7 +111,7 @@ def render_translated(
             reason = " ".join(str(error).split())
             raise InputError(f"Mitsuba cannot load the scene: {reason}") from None
         done_spp = 0
-        statistics: dict[str, _Statistics] = {}
+        statistics: dict[Quantity, _Statistics] = {}
         while done_spp < spp:
             if done_spp and timeout_s is not None and time.perf_counter() - started > timeout_s:
                 _LOG.info("out of time after %d of %d spp", done_spp, spp)
@@ -135,7 +135,7 @@ def render_translated(
     )
 
 
-def _check_quantities(quantities: Sequence[str]) -> None:
+def _check_quantities(quantities: Sequence[Quantity]) -> None:
     if "color" not in quantities or not set(quantities) <= set(CHANNELS):
         raise InputError(
             f"quantities: expected color and others of {', '.join(CHANNELS)}, got {', '.join(quantities)}"
@@ -143,7 +143,7 @@ def _check_quantities(quantities: Sequence[str]) -> None:
 
 
 def _scene_with_integrator(
-    translated: TranslatedScene, threads: int | None, quantities: Sequence[str]
+    translated: TranslatedScene, threads: int | None, quantities: Sequence[Quantity]
 ) -> dict[str, Any]:
     integrator = {
         "type": "tungsten_path",
@@ -233,7 +233,7 @@ def _weighted_mean(a: FloatImage, weight_a: FloatImage, b: FloatImage, weight_b:
     return mean
 
 
-def _statistics(pixels: FloatImage, quantities: Sequence[str]) -> dict[str, _Statistics]:
+def _statistics(pixels: FloatImage, quantities: Sequence[Quantity]) -> dict[Quantity, _Statistics]:
     """Split what the integrator returns; mitsuba_ext/tungsten_path.cpp describes it."""
     statistics = {}
     start = 0
