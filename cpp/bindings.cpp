@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <array>
 #include <limits>
-#include <map>
 #include <optional>
 #include <string>
 #include <utility>
@@ -72,28 +71,19 @@ Buffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a, co
 
 Array array_like(const Image& image) { return Array({image.height, image.width, image.channels}); }
 
-Quantity quantity_from_name(const std::string& name) {
-    static const std::map<std::string, Quantity> quantities{{"color", Quantity::color},
-                                                            {"albedo", Quantity::albedo},
-                                                            {"normal", Quantity::normal},
-                                                            {"depth", Quantity::depth},
-                                                            {"visibility", Quantity::visibility}};
-    const auto found = quantities.find(name);
-    if (found == quantities.end()) {
-        throw py::value_error("quantity: expected color, albedo, normal, depth or visibility, got " + name);
-    }
-    return found->second;
-}
-
 // Returns the planes, those with defects as mended copies, and the defects of each.
 py::tuple sanitize(const std::string& quantity_name, const py::array& mean, const OptionalArray& half_a,
                    const OptionalArray& half_b, const OptionalArray& variance, int threads) {
-    const Quantity quantity = quantity_from_name(quantity_name);
+    const std::optional<Quantity> quantity = quantity_from_name(quantity_name);
+    if (!quantity) {
+        throw py::value_error("quantity: expected color, albedo, normal, depth or visibility, got " +
+                              quantity_name);
+    }
     Buffer buffer = buffer_from_arrays(mean, half_a, half_b, variance);
     BufferDefects defects;
     {
         const py::gil_scoped_release release;
-        defects = find_defects(buffer, quantity, threads);
+        defects = find_defects(buffer, *quantity, threads);
     }
     const auto copied_if_defective = [](const OptionalArray& array, const Defects& found, Image& image) {
         if (!array || !found.any()) return py::object(array ? py::object(*array) : py::none());
@@ -108,7 +98,7 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
                                             copied_if_defective(variance, defects.variance, buffer.variance));
     if (defects.any()) {
         const py::gil_scoped_release release;
-        mend(buffer, quantity);
+        mend(buffer, *quantity);
     }
     return py::make_tuple(planes,
                           py::make_tuple(defects.mean, defects.half_a, defects.half_b, defects.variance));

@@ -5,10 +5,14 @@
 // radiance. `threads` 0 uses every core; no result depends on it, to the bit.
 #pragma once
 
+#include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <functional>
 #include <limits>
+#include <optional>
+#include <string_view>
 #include <type_traits>
 
 namespace tungsten_dip {
@@ -50,6 +54,20 @@ struct Buffer {
 };
 
 enum class Quantity : std::uint8_t { color, albedo, normal, depth, visibility };
+
+// By the value of a Quantity.
+inline constexpr std::array<std::string_view, 5> quantity_names{"color", "albedo", "normal", "depth",
+                                                                "visibility"};
+
+constexpr std::size_t channel_count(Quantity quantity) {
+    return quantity == Quantity::depth || quantity == Quantity::visibility ? 1 : 3;
+}
+
+constexpr std::optional<Quantity> quantity_from_name(std::string_view name) {
+    const auto* found = std::ranges::find(quantity_names, name);
+    if (found == quantity_names.end()) return std::nullopt;
+    return static_cast<Quantity>(found - quantity_names.begin());
+}
 
 // Calls body(0) ... body(count - 1), in any order, from several threads. The first exception is thrown again
 // here.

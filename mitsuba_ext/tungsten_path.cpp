@@ -163,13 +163,19 @@ class FilterTable {
     std::array<float, bin_count> sums_{};
 };
 
-enum Quantity : uint8_t { color, albedo, normal, depth, visibility };
-constexpr std::array<std::string_view, 5> quantity_names{"color", "albedo", "normal", "depth", "visibility"};
-constexpr size_t quantity_count = quantity_names.size();
+using tungsten_dip::Quantity;
+using enum Quantity;
 
-constexpr size_t channel_count(Quantity quantity) {
-    return quantity == depth || quantity == visibility ? 1 : 3;
-}
+// A value for every quantity.
+template <typename T>
+class ByQuantity {
+  public:
+    T& operator[](Quantity quantity) { return values_[static_cast<size_t>(quantity)]; }
+    const T& operator[](Quantity quantity) const { return values_[static_cast<size_t>(quantity)]; }
+
+  private:
+    std::array<T, tungsten_dip::quantity_names.size()> values_{};
+};
 
 // What one camera ray tells: a quantity that it says nothing of stays empty and is not averaged.
 class Sample {
@@ -184,7 +190,7 @@ class Sample {
     }
 
   private:
-    std::array<std::optional<std::array<float, 3>>, quantity_count> values_;
+    ByQuantity<std::optional<std::array<float, 3>>> values_;
 };
 
 // The statistics of one quantity of one pixel. Samples that are not finite are left out.
@@ -284,9 +290,9 @@ class TungstenPath final : public Variant::Integrator {
         std::istringstream names{std::string(
             properties.get<std::string_view>("quantities", "color albedo normal depth visibility"))};
         for (std::string name; names >> name;) {
-            const auto* found = std::ranges::find(quantity_names, name);
-            if (found == quantity_names.end()) Throw("quantities: unknown quantity \"%s\"", name);
-            quantities_.push_back(static_cast<Quantity>(found - quantity_names.begin()));
+            const auto quantity = tungsten_dip::quantity_from_name(name);
+            if (!quantity) Throw("quantities: unknown quantity \"%s\"", name);
+            quantities_.push_back(*quantity);
         }
         constexpr std::string_view prefix = "albedo_";
         for (const auto& property : properties)
@@ -355,7 +361,7 @@ class TungstenPath final : public Variant::Integrator {
 
     void render_pixel(const Scene& scene, const Sensor& sensor, Vector<uint32_t, 2> position,
                       Vector<uint32_t, 2> size, Random random, uint32_t spp, float* out) const {
-        std::array<Accumulator, quantity_count> accumulators;
+        ByQuantity<Accumulator> accumulators;
         for (uint32_t i = 0; i < spp && !should_stop(); ++i) {
             const Vector2 offset = filter_.sample(random.next_2d());
             const Point2 film((static_cast<float>(position.x()) + pixel_center_ + offset.x()) /
@@ -374,8 +380,9 @@ class TungstenPath final : public Variant::Integrator {
                 if (const auto& value = sample.get(quantity)) accumulators[quantity].add(*value);
         }
         for (const Quantity quantity : quantities_) {
-            accumulators[quantity].store(channel_count(quantity), out);
-            out += 3 * channel_count(quantity) + 1;
+            const size_t channels = channel_count(quantity);
+            accumulators[quantity].store(channels, out);
+            out += 3 * channels + 1;
         }
     }
 
