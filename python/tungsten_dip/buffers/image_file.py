@@ -62,6 +62,18 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
 
 
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of an .exr file that is there (of its first part, if of several).
+
+    Raises InputError if it is damaged.
+    """
+    try:
+        header: dict[str, Any] = OpenEXR.File(str(path), header_only=True).parts[0].header
+    except (IndexError, OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
+    return header
+
+
 def first_pixel(path: Path) -> tuple[int, int] | None:
     """Return column and row of the first pixel of a readable .exr file (of its first part, if of several).
 
@@ -69,7 +81,7 @@ def first_pixel(path: Path) -> tuple[int, int] | None:
     """
     if path.suffix.lower() != ".exr":
         return None
-    column, row = OpenEXR.File(str(path), header_only=True).parts[0].header["dataWindow"][0]
+    column, row = read_attributes(path)["dataWindow"][0]
     return int(column), int(row)
 
 

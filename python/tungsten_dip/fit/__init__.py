@@ -9,7 +9,7 @@ from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
-from tungsten_dip.fit.preparation import finished, prepared
+from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
@@ -89,4 +89,4 @@ def denoise(
             from tungsten_dip.fit.fusion import fit_fusion
 
         result = fit_fusion(known.buffers, settings, progress, known.candidates, warm_start, known.previous)
-    return finished(result, known)
+    return completed(result, known)

@@ -51,7 +51,7 @@ def prepared(
     return Prepared(buffers, given, previous, (*foreign, *repaired))
 
 
-def finished(result: FitResult, known: Prepared) -> FitResult:
+def completed(result: FitResult, known: Prepared) -> FitResult:
     """Return the result with the notes on its input before its own, all of which are logged.
 
     Where alpha and colour of the input are 0 the result is black: radiance without coverage would glow around

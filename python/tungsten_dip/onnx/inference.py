@@ -18,7 +18,7 @@ from tungsten_dip.fit.fusion import blends_all_samples
 from tungsten_dip.fit.model import Model, check_finite, check_planes
 from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
-from tungsten_dip.fit.preparation import finished, prepared
+from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.published.images import network_input, paper_images
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
@@ -67,7 +67,7 @@ def infer(
         if refit_steps or known.candidates or known.previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
         result = _infer_paper(model, known.buffers, settings, progress)
-    return finished(result, known)
+    return completed(result, known)
 
 
 def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:

@@ -21,7 +21,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.preparation import finished, prepared
+from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.onnx.inference import infer_fusion
@@ -120,7 +120,7 @@ class Follower:
         result = followed.result
         self._error = _typical_error(result)
         self._last = _Last(buffers, smooth, camera, result)
-        return replace(followed, result=finished(result, known))
+        return replace(followed, result=completed(result, known))
 
     def _tell_what_is_missing(self, buffers: RenderBuffers) -> None:
         if buffers.depth is None and not self._told_of_depth:

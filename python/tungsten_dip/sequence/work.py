@@ -12,10 +12,9 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
-from typing import Any
+from typing import Any, Literal
 
-import OpenEXR
-
+from tungsten_dip.buffers.image_file import read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
 from tungsten_dip.buffers.source import OWN
 from tungsten_dip.buffers.write import write_denoised
@@ -23,7 +22,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_scene
-from tungsten_dip.sequence.following import Follower, Models, Refit
+from tungsten_dip.sequence.following import Follower, How, Models, Refit
 from tungsten_dip.sequence.frames import Frame
 
 _RECORD = OWN + "frame"
@@ -37,7 +36,7 @@ _NOT_OF_THE_IMAGE = ("threads", "device")
 class Run:
     """What holds for all frames of a run.
 
-    ``float16`` stores pictures as 16-bit floats. ``warm_start`` is the SHA-256 of the file of the model that
+    ``float16`` stores pictures as 16-bit floats. ``warm_start_sha256`` is that of the file of the model that
     the first frame starts from, if any.
     """
 
@@ -45,20 +44,20 @@ class Run:
     refit: Refit = "auto"
     mapping: dict[str, str] = field(default_factory=dict)
     float16: bool = False
-    warm_start: str | None = None
+    warm_start_sha256: str | None = None
 
 
 @dataclass(frozen=True)
 class Record:
-    """What became of a frame. ``how`` is as in `following.Followed`; ``error`` says why there is no result.
+    """What became of a frame. ``how`` is as in `following.Followed`, empty without a result.
 
-    ``seconds`` is all that the frame took but for writing it. ``flicker`` is that against the frame before,
-    where the run denoised it. ``skipped``: it was finished before.
+    ``error`` says why there is none. ``seconds`` is all that the frame took but for writing it. ``flicker``
+    is that against the frame before, where the run denoised it. ``skipped``: it was finished before.
     """
 
     number: int
     output: str
-    how: str = ""
+    how: Literal[How, ""] = ""
     seconds: float = 0.0
     iterations: int = 0
     estimated_relmse: float | None = None
@@ -73,14 +72,14 @@ def finished(frame: Frame, run: Run) -> Record | None:
     Raises InputError if the input is missing.
     """
     key = _key(frame, run)
-    if not frame.output.is_file():  # of which OpenEXR would complain on stderr
+    if not frame.output.is_file():
         return None
     try:
-        stored = json.loads(OpenEXR.File(str(frame.output), header_only=True).parts[0].header[_RECORD])
+        stored = json.loads(read_attributes(frame.output)[_RECORD])
         if stored.pop("key") != key:
             return None
         return Record(**{**stored, "number": frame.number, "output": str(frame.output), "skipped": True})
-    except (AttributeError, IndexError, KeyError, OSError, RuntimeError, TypeError, ValueError):
+    except (AttributeError, InputError, KeyError, TypeError, ValueError):
         return None
 
 
@@ -171,6 +170,6 @@ def _key(frame: Frame, run: Run) -> str:
     except OSError as error:
         raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
     settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
-    asked = (settings, run.refit, run.mapping, run.float16, run.warm_start)
+    asked = (settings, run.refit, run.mapping, run.float16, run.warm_start_sha256)
     facts: list[Any] = [stats, *asked, metadata.version("tungsten-dip")]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
