@@ -33,7 +33,7 @@ from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import display_from_radiance
-from tungsten_dip.scene.types import Camera, PinholeCamera, Scene, ThinlensCamera
+from tungsten_dip.scene.types import Camera, PerspectiveCamera, Scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -276,7 +276,7 @@ def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoi
     follower = Follower(settings, models=Models(first=warm_start))
 
     def denoise(camera: Camera, buffers: RenderBuffers) -> FitResult:
-        known = camera if isinstance(camera, PinholeCamera | ThinlensCamera) else None
+        known = camera if isinstance(camera, PerspectiveCamera) else None
         if known is None:
             _LOG.info("a camera of type %s moves no frame into place", camera.kind)
         with progress_on_stderr("denoising") as progress:
