@@ -16,45 +16,44 @@ compared with less noise by the next, which may look further and average more. A
 few samples are still noisy at the edges of lights and in mirrors."""
 
 
-def prefilter_features(
-    buffers: RenderBuffers,
-    threads: int | None = None,
-    passes: Sequence[tuple[int, int, float]] | None = None,
-) -> RenderBuffers:
-    """Return buffers whose features are filtered by non-local means, each half with the other's weights.
+def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:
+    """Return sanitised buffers with every feature filtered as guide of a regression; see `prefilter_feature`.
+
+    ``threads`` None uses every core.
+    """
+    filtered = {
+        name: prefilter_feature(feature, _PASSES, thread_count(threads), signed=name == "normal")
+        for name in FEATURES
+        if (feature := buffers.get(name)) is not None
+    }
+    return buffers.with_quantities(**filtered)
+
+
+def prefilter_feature(
+    feature: Buffer, passes: Sequence[tuple[int, int, float]], threads: int, *, signed: bool = False
+) -> Buffer:
+    """Return a sanitised feature filtered by non-local means, each half with the other's weights.
 
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
-    Renderings", section 5.1. The variance of a filtered feature is that of the noise which remains in it.
-    Values whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A
-    feature without halves is filtered with weights of its own, by the noise estimated from its second
-    differences. Normals are not normalised again. Expects sanitised buffers. ``threads`` None uses every
-    core. ``passes`` are radius, step and standard deviations of each; None: those for guides of a regression.
+    Renderings", section 5.1. The variance of the result is that of the noise which remains in it. Values
+    whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A feature
+    without halves is filtered with weights of its own, by the noise estimated from its second differences.
+    ``signed`` values, such as normals, may be negative; they are not normalised again. ``passes`` are radius,
+    step and standard deviations of each.
     """
-    filtered: dict[str, Buffer | None] = {}
-    for name in FEATURES:
-        feature = buffers.get(name)
-        if feature is not None:
-            mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
-            if feature.halves is None:
-                variance = noise_in(mean, thread_count(threads))
-            for radius, step, k in passes or _PASSES:
-                mean, half_a, half_b, variance = _core.prefilter_feature(
-                    mean,
-                    half_a,
-                    half_b,
-                    variance,
-                    radius=radius,
-                    step=step,
-                    k=k,
-                    threads=thread_count(threads),
-                )
-            if name != "normal":
-                # Where negative values were repaired, the mean is not that of the halves and may be negative.
-                np.maximum(mean, 0, out=mean)
-            filtered[name] = Buffer(mean, half_a, half_b, variance)
-            if feature.halves is None:
-                filtered[name] = Buffer(mean, variance=variance)
-    return buffers.with_quantities(**filtered)
+    mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
+    if feature.halves is None:
+        variance = noise_in(mean, threads)
+    for radius, step, k in passes:
+        mean, half_a, half_b, variance = _core.prefilter_feature(
+            mean, half_a, half_b, variance, radius=radius, step=step, k=k, threads=threads
+        )
+    if not signed:
+        # Where negative values were repaired, the mean is not that of the halves and may be negative.
+        np.maximum(mean, 0, out=mean)
+    if feature.halves is None:
+        return Buffer(mean, variance=variance)
+    return Buffer(mean, half_a, half_b, variance)
 
 
 def noise_in(image: FloatImage, threads: int) -> FloatImage:

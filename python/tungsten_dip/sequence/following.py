@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from tungsten_dip.buffers.model import Halves, RenderBuffers
-from tungsten_dip.buffers.prefilter import prefilter_features
+from tungsten_dip.buffers.prefilter import prefilter_feature
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
@@ -130,10 +130,11 @@ class Follower:
             )
 
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
-        alone = buffers.with_quantities(normal=None, depth=None)
-        return buffers.with_quantities(
-            albedo=prefilter_features(alone, self._settings.threads, _ALBEDO_PASSES).albedo
-        )
+        if buffers.albedo is None:
+            return buffers
+        threads = thread_count(self._settings.threads)
+        albedo = prefilter_feature(buffers.albedo, _ALBEDO_PASSES, threads)
+        return buffers.with_quantities(albedo=albedo)
 
     def _follow(
         self, buffers: RenderBuffers, smooth: RenderBuffers, camera: Camera | None, progress: Progress
