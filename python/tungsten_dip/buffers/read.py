@@ -269,7 +269,10 @@ def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, str]]:
 
 
 def _share(stacked: FloatImage, sources: list[tuple[Part, str]]) -> None:
-    """Let channels that were read be views of the image made of them: at 4K that saves more than a GiB."""
+    """Let channels that were read be views of the image made of them: at 4K that saves more than a GiB.
+
+    In place: what was read is freed image by image, whoever else holds its part.
+    """
     for index, (part, name) in enumerate(sources):
         if part.channels[name].dtype == np.float32:
             part.channels[name] = stacked[..., index]

@@ -135,12 +135,12 @@ def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:
         names = "RGB" if CHANNELS[quantity] == 3 else "Y"
         for field, plane in buffer.planes():
             files[quantity + PLANES[field]] = Part(_channels("", names, plane), frame)
-    color = files.pop("color")
+    channels = dict(files.pop("color").channels)
     if buffers.alpha is not None:
-        color.channels["A"] = buffers.alpha[..., 0]
+        channels["A"] = buffers.alpha[..., 0]
     if isinstance(buffers.spp, np.ndarray):
-        color.channels["spp.Y"] = buffers.spp[..., 0]
-    files["color"] = Part(color.channels, {**frame, **buffers.attributes, **_spp(buffers)})
+        channels["spp.Y"] = buffers.spp[..., 0]
+    files["color"] = Part(channels, {**frame, **buffers.attributes, **_spp(buffers)})
     try:
         folder.mkdir(parents=True, exist_ok=True)
         stale = [
