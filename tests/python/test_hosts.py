@@ -118,9 +118,11 @@ def test_available_memory_is_a_part_of_the_whole() -> None:
     assert 0 < available < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def test_unknown_quantities_are_told_before_memory_is(scene_path: Path) -> None:
-    with pytest.raises(InputError, match=r"quantities: expected color and others of .*, got color, albdo"):
-        render(load_scene(scene_path), quantities=("color", "albdo"))
+@pytest.mark.parametrize("quantities", [("depth",), ("color", "albdo")])
+def test_unknown_quantities_are_told_before_memory_is(quantities: Any, scene_path: Path) -> None:
+    found = ", ".join(quantities)
+    with pytest.raises(InputError, match=rf"quantities: expected color and others of .*, got {found}"):
+        render(load_scene(scene_path), quantities=quantities)
 
 
 def test_unknown_host(scene_path: Path) -> None:

@@ -479,12 +479,10 @@ def test_cancel_ends_a_path_without_end() -> None:
         {"spp": 0},
         {"spp": 1, "seed": -1},
         {"spp": 1, "threads": 0},
-        {"spp": 1, "quantities": ("depth",)},
-        {"spp": 1, "quantities": ("color", "albdo")},
     ],
 )
 def test_arguments_out_of_range(arguments: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"expected (a number|color)"):
+    with pytest.raises(InputError, match="expected a number"):
         render_translated(ball(), **arguments)
 
 

@@ -78,7 +78,7 @@ def render(
     path = folder / "scene.json"
     path.write_text(json.dumps(scene))
     with mitsuba_variant():
-        return render_translated(translate(load_scene(path)), spp, threads=1)
+        return render_translated(translate(load_scene(path)), spp=spp, threads=1)
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import get_args
 
 import tungsten_dip
 from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
@@ -25,6 +26,7 @@ from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_re
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
+from tungsten_dip.hosts import Host, chosen_host
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
@@ -92,9 +94,7 @@ def _run(arguments: Sequence[str] | None) -> None:
         if path is not None and count > 1:
             raise InputError(f"{path}: one file for {count} scenes; render them one at a time")
 
-    host = options.host
-    if host == "auto":
-        host = "tungsten" if tungsten_host.available() else "mitsuba"
+    host = chosen_host(options.host)
     _LOG.info("rendering with %s", host.capitalize())
     if host == "mitsuba" and (options.checkpoint or options.dip_preview):
         raise InputError(
@@ -146,8 +146,12 @@ def _parser() -> argparse.ArgumentParser:
     add("-s", "--seed", metavar="N", type=int, help="random seed of the render")
     add("-o", "--output-file", metavar="FILE", type=Path, help="PNG in place of the scene's output_file")
     add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR or PFM in place of the scene's")
-    hosts = ("auto", "tungsten", "mitsuba")
-    add("--host", choices=hosts, default="auto", help="who renders (auto: Tungsten if it was built in)")
+    add(
+        "--host",
+        choices=get_args(Host),
+        default="auto",
+        help="who renders (auto: Tungsten if it was built in)",
+    )
     dip = parser.add_argument_group("denoising")
     dip.add_argument(
         "--dip-denoise", action="store_true", help="denoise the picture with a network fitted to it"

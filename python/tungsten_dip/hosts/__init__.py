@@ -21,6 +21,15 @@ _RENDERING = threading.Lock()
 Host = Literal["auto", "tungsten", "mitsuba"]
 
 
+def chosen_host(host: Host) -> Literal["tungsten", "mitsuba"]:
+    """Return who renders, of "auto" what `render` says."""
+    from tungsten_dip.hosts import tungsten
+
+    if host != "auto":
+        return host
+    return "tungsten" if tungsten.available() else "mitsuba"
+
+
 def render(
     scene: Scene | Path | str,
     host: Host = "auto",
@@ -42,8 +51,7 @@ def render(
     from tungsten_dip.hosts import tungsten
     from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 
-    if host == "auto":
-        host = "tungsten" if tungsten.available() else "mitsuba"
+    host = chosen_host(host)
     path, folder = (scene.path, scene.input_directory) if isinstance(scene, Scene) else (scene, None)
     _LOG.info("%s: rendered by %s", path, host.capitalize())
     with _RENDERING:

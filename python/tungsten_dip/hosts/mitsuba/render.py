@@ -63,25 +63,29 @@ def render(
         _LOG.info(
             "adaptive_sampling and stratified_sampler rest: every pixel gets as many independent samples"
         )
-    _check_quantities(quantities)
+    if "color" not in quantities or not set(quantities) <= set(CHANNELS):
+        raise InputError(
+            f"quantities: expected color and others of {', '.join(CHANNELS)}, got {', '.join(quantities)}"
+        )
     check_fits_mitsuba(scene, quantities)
     with mitsuba_variant():
         from tungsten_dip.hosts.mitsuba.translate import translate
 
         return render_translated(
             translate(scene),
-            scene.renderer.spp if spp is None else spp,
-            seed,
-            threads,
-            timeout_s,
-            scene.renderer.spp_step,
-            progress,
-            quantities,
+            spp=scene.renderer.spp if spp is None else spp,
+            seed=seed,
+            threads=threads,
+            timeout_s=timeout_s,
+            spp_step=scene.renderer.spp_step,
+            progress=progress,
+            quantities=quantities,
         )
 
 
 def render_translated(
     translated: TranslatedScene,
+    *,
     spp: int,
     seed: int = 0,
     threads: int | None = None,
@@ -98,7 +102,6 @@ def render_translated(
     for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
         if value is not None and not 1 <= value < 2**31:
             raise InputError(f"{name}: expected a number from 1 to {2**31 - 1}, got {value}")
-    _check_quantities(quantities)
     if not 0 <= seed < 2**32:
         raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {seed}")
     started = time.perf_counter()
@@ -120,7 +123,7 @@ def render_translated(
             pass_seed = int(np.random.SeedSequence([seed, done_spp]).generate_state(1)[0])
             part = part_of(progress, done_spp / spp, (done_spp + pass_spp) / spp, f"{spp} spp")
             pixels = _render_pass(mitsuba, scene, pass_spp, pass_seed, part)
-            for name, rendered in _statistics(pixels, quantities).items():
+            for name, rendered in _statistics_from_pixels(pixels, quantities).items():
                 statistics[name] = statistics[name].merged(rendered) if name in statistics else rendered
             done_spp += pass_spp
     _LOG.info("Mitsuba %s rendered %d spp in %.1f s", VERSION, done_spp, time.perf_counter() - started)
@@ -133,13 +136,6 @@ def render_translated(
         spp=float(done_spp),
         attributes={"renderer": f"Mitsuba {VERSION}", "integrator": "path_tracer", "seed": str(seed)},
     )
-
-
-def _check_quantities(quantities: Sequence[Quantity]) -> None:
-    if "color" not in quantities or not set(quantities) <= set(CHANNELS):
-        raise InputError(
-            f"quantities: expected color and others of {', '.join(CHANNELS)}, got {', '.join(quantities)}"
-        )
 
 
 def _scene_with_integrator(
@@ -233,7 +229,9 @@ def _weighted_mean(a: FloatImage, weight_a: FloatImage, b: FloatImage, weight_b:
     return mean
 
 
-def _statistics(pixels: FloatImage, quantities: Sequence[Quantity]) -> dict[Quantity, _Statistics]:
+def _statistics_from_pixels(
+    pixels: FloatImage, quantities: Sequence[Quantity]
+) -> dict[Quantity, _Statistics]:
     """Split what the integrator returns; mitsuba_ext/tungsten_path.cpp describes it."""
     statistics = {}
     start = 0
