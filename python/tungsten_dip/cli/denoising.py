@@ -15,6 +15,7 @@ from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.scene.types import TonemapName
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -97,7 +98,12 @@ def write_model(path: Path, result: FitResult) -> None:
 
 
 def write_report(
-    path: Path, title: str, buffers: RenderBuffers, result: FitResult, tonemap: str, remarks: Sequence[str]
+    path: Path,
+    title: str,
+    buffers: RenderBuffers,
+    result: FitResult,
+    tonemap: TonemapName,
+    remarks: Sequence[str],
 ) -> None:
     """Write the HTML page whole or not at all."""
     from tungsten_dip.report.page import report_page  # imports all of the scene layer

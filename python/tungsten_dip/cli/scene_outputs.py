@@ -11,7 +11,7 @@ from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writab
 from tungsten_dip.buffers.display import ldr_from_feature
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
 from tungsten_dip.scene.tonemap import display_from_radiance
-from tungsten_dip.scene.types import OutputBuffer, Scene
+from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName
 
 _LOG = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def _known(name: str, suffixes: tuple[str, ...]) -> str:
     return written
 
 
-def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: str) -> None:
+def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: TonemapName) -> None:
     """Write the picture and the buffers that the scene asks for.
 
     What it asks for and this render does not have, such as the halves of 1 spp, is removed where an earlier

@@ -35,7 +35,7 @@ from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import display_from_radiance
-from tungsten_dip.scene.types import Camera, PerspectiveCamera, Scene
+from tungsten_dip.scene.types import Camera, PerspectiveCamera, Scene, TonemapName
 
 _LOG = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ def write_outputs(
     result: FitResult,
     buffers: RenderBuffers,
     outputs: SceneOutputs,
-    tonemap: str,
+    tonemap: TonemapName,
     report: Path | None = None,
     remarks: Sequence[str] = (),
     save_model: Path | None = None,

@@ -29,6 +29,7 @@ from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.progress import Progress, silent
+from tungsten_dip.scene.types import TonemapName
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ class Rendered:
     buffers: RenderBuffers
     output_file: Path | None
     hdr_output_file: Path | None
-    tonemap: str
+    tonemap: TonemapName
 
 
 def available() -> bool:

@@ -17,6 +17,7 @@ from tungsten_dip.report.html import Picture
 from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.preview import error_in_false_color
 from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.scene.types import TonemapName
 
 _CURVE_HEIGHT = 260
 _SKY_DEPTH = 1e9
@@ -24,7 +25,7 @@ _SKY_DEPTH = 1e9
 
 
 def report_page(
-    title: str, buffers: RenderBuffers, result: FitResult, tonemap: str, remarks: Sequence[str] = ()
+    title: str, buffers: RenderBuffers, result: FitResult, tonemap: TonemapName, remarks: Sequence[str] = ()
 ) -> str:
     """Return the page for one fit, its pictures displayed with one of Tungsten's tonemaps.
 

@@ -19,7 +19,7 @@ DEFAULT_TONEMAP: TonemapName = "gamma"
 _SATURATED = np.float32(1e6)
 
 
-def display_from_radiance(radiance: FloatImage, tonemap: str) -> FloatImage:
+def display_from_radiance(radiance: FloatImage, tonemap: TonemapName) -> FloatImage:
     """Return display values in [0, 1] of linear radiance, any shape; NaN and negative radiance become black.
 
     Raises InputError if Tungsten has no such tonemap.
@@ -51,7 +51,7 @@ def _pbrt(light: FloatImage) -> FloatImage:
     return np.where(light < 0.0031308, 12.92 * light, 1.055 * np.power(light, 1.0 / 2.4) - 0.055)
 
 
-_CURVES: dict[str, Callable[[FloatImage], FloatImage]] = {
+_CURVES: dict[TonemapName, Callable[[FloatImage], FloatImage]] = {
     "linear": _linear,
     "gamma": ldr_from_radiance,
     "reinhard": _reinhard,

@@ -13,6 +13,7 @@ from tungsten_dip.report.html import Picture
 from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.preview import block_means
 from tungsten_dip.scene.tonemap import display_from_radiance
+from tungsten_dip.scene.types import TonemapName
 from tungsten_dip.sequence.work import Record
 
 _MOST_PICTURES = 24
@@ -26,7 +27,7 @@ _FLICKER_NOTE = (
 )
 
 
-def sequence_page(title: str, records: Sequence[Record], tonemap: str) -> str:
+def sequence_page(title: str, records: Sequence[Record], tonemap: TonemapName) -> str:
     """Return the page, in HTML that needs no network.
 
     Pictures are read from the records' outputs: all, or as many evenly spaced ones as a page can hold.
@@ -64,7 +65,7 @@ def _figures(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
         yield "without a result", str(failures)
 
 
-def _strip(done: Sequence[Record], tonemap: str) -> Iterator[Picture]:
+def _strip(done: Sequence[Record], tonemap: TonemapName) -> Iterator[Picture]:
     chosen = np.unique(np.linspace(0, len(done) - 1, min(len(done), _MOST_PICTURES)).round().astype(int))
     for record in (done[index] for index in chosen if done):
         color = read_image(Path(record.output))
