@@ -26,7 +26,7 @@ if (package / "errors.py").exists():
 import _tungsten
 sys.modules["tungsten_dip._tungsten"] = _tungsten
 if sys.argv[1:2] == ["--dip-render-buffers"]:
-    from tungsten_dip.hosts.tungsten import render_to_folder as main
+    from tungsten_dip.hosts.native import render_to_folder as main
 else:
     from tungsten_dip.cli.tungsten import main
 sys.argv[0] = "tungsten"

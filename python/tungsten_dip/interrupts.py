@@ -1,11 +1,14 @@
-"""Defers Ctrl-C while libraries load, and raises it again after a fit that it ended early."""
+"""What Ctrl-C does while libraries load, a fit trains or a pass renders."""
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+
+_LOG = logging.getLogger(__name__)
 
 
 def held_interrupts() -> AbstractContextManager[None]:
@@ -25,24 +28,48 @@ def heeded_interrupts() -> AbstractContextManager[None]:
 
 
 @contextmanager
+def requested_interrupts(warning: str) -> Iterator[Callable[[], bool]]:
+    """Turn a first Ctrl-C within the block into a request that can be asked for; a second ends the process.
+
+    The warning is logged at the first.
+    """
+    requested = False
+
+    def request() -> None:
+        nonlocal requested
+        requested = True
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        _LOG.warning(warning)
+
+    with _on_interrupt(request):
+        yield lambda: requested
+
+
+@contextmanager
 def _noted_interrupts(at_once: bool) -> Iterator[None]:
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    # A background job of a shell ignores Ctrl-C; None is a handler that was not installed from Python.
-    if not in_main_thread or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
-        yield
-        return
     pressed = False
 
-    def note(number: int, frame: object) -> None:
+    def note() -> None:
         nonlocal pressed
         pressed = True
         if at_once:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
+    with _on_interrupt(note):
+        yield
+    if pressed:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _on_interrupt(handle: Callable[[], None]) -> Iterator[None]:
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    # A background job of a shell ignores Ctrl-C; None is a handler that was not installed from Python.
+    if not in_main_thread or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda number, frame: handle())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt

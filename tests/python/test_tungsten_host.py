@@ -20,7 +20,7 @@ from tungsten_dip.buffers import read_image, write_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.hosts import memory, tungsten
+from tungsten_dip.hosts import memory, native, tungsten
 from tungsten_dip.scene import load_scene
 
 ROOT, BUILD = os.environ.get("Tungsten_ROOT"), os.environ.get("Tungsten_BUILD")  # noqa: SIM112
@@ -123,7 +123,7 @@ def test_command_without_dip_flags_writes_the_bytes_of_the_stock_command(write_s
     # Splats from several threads add up in the order in which they come: one thread there.
     threads = "1" if "integrator" in scene else "2"
     stock = _stock(path, tmp_path / "stock", threads)
-    ours = _run(tungsten.executable(), path, tmp_path / "ours", threads)
+    ours = _run(native.executable(), path, tmp_path / "ours", threads)
     assert len(_files(stock)) >= 2
     assert _files(ours) == _files(stock)
 
@@ -132,7 +132,7 @@ def test_command_without_dip_flags_fails_where_a_scene_fails(write_scene, tmp_pa
     broken = tmp_path / "broken.json"
     broken.write_text("{")
     result = subprocess.run(
-        [tungsten.executable(), "-d", tmp_path / "out", broken, write_scene()],
+        [native.executable(), "-d", tmp_path / "out", broken, write_scene()],
         capture_output=True,
         check=False,
     )
@@ -413,7 +413,7 @@ def test_python_runs_on_while_tungsten_renders(write_scene):
 
 def test_the_native_command_runs_the_package_and_fails_in_one_line(tmp_path):
     result = subprocess.run(
-        [tungsten.executable(), "--dip-denoise", tmp_path / "missing.json"],
+        [native.executable(), "--dip-denoise", tmp_path / "missing.json"],
         env={**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable},
         capture_output=True,
         text=True,
@@ -428,7 +428,7 @@ def test_the_native_command_runs_no_code_beside_the_scene(tmp_path):
     for module in ("json", "logging"):
         (tmp_path / f"{module}.py").write_text("open('ran', 'w')")
     result = subprocess.run(
-        [tungsten.executable(), "--dip-denoise", "missing.json"],
+        [native.executable(), "--dip-denoise", "missing.json"],
         cwd=tmp_path,
         env={**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable},
         capture_output=True,

@@ -28,6 +28,7 @@ from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import Host, chosen_host
 from tungsten_dip.hosts import tungsten as tungsten_host
+from tungsten_dip.hosts.native import run_native
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
@@ -101,9 +102,9 @@ def _run(arguments: Sequence[str] | None) -> None:
             "Mitsuba saves no checkpoints for --checkpoint and --dip-preview; add --host tungsten"
         )
     if host == "tungsten" and not options.dip_denoise:
-        tungsten_host.run_native(_stock_arguments(arguments))
+        run_native(_stock_arguments(arguments))
     if host == "tungsten" and not tungsten_host.in_process():
-        tungsten_host.run_native(arguments)
+        run_native(arguments)
 
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)

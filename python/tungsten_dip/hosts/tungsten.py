@@ -1,26 +1,19 @@
 """Tungsten itself as the host: renders a scene in this process and hands over its camera's buffers.
 
 The package must have been built against a Tungsten (docs/tungsten.md). Where Tungsten's libraries cannot
-be linked into a Python module, `render` goes through the native command, which has the hook linked in.
+be linked into a Python module, `render` goes through the native command (`hosts.native`), which has the hook
+linked in.
 """
 
 from __future__ import annotations
 
 import importlib
-import json
 import logging
-import os
-import signal
-import subprocess
-import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +21,12 @@ from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
+from tungsten_dip.hosts.native import BUILD_HINT, executable, render_in_child
+from tungsten_dip.interrupts import requested_interrupts
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import TonemapName
 
 _LOG = logging.getLogger(__name__)
-
-BUILD_HINT = "build the package with Tungsten_ROOT set to a Tungsten checkout (docs/tungsten.md)"
 
 _Arrays = Mapping[str, Any]
 """What the hook hands over: {quantity: {mean, half_a, half_b, variance}, "spp": a number or an array}."""
@@ -84,25 +77,8 @@ def available() -> bool:
 
 
 def in_process() -> bool:
-    """Return whether Tungsten can render in this process; otherwise `run_native` can do everything."""
+    """Return whether Tungsten can render in this process; otherwise the native command can do everything."""
     return _module() is not None
-
-
-def executable() -> Path | None:
-    """Return the native ``tungsten`` command that was built with this package, or None."""
-    path = Path(__file__).parents[1] / "bin" / "tungsten"
-    return path if os.access(path, os.X_OK) else None
-
-
-def run_native(arguments: Sequence[str]) -> NoReturn:
-    """Replace this process by the native command; without ``--dip-`` flags that is stock Tungsten.
-
-    Raises InputError if the package was built without a Tungsten.
-    """
-    command = _require_executable()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execve(command, ["tungsten", *arguments], _environment())
 
 
 def render(
@@ -124,7 +100,8 @@ def render(
     folder = None if input_directory is None else Path(input_directory)
     options = DriverOptions(spp=spp, seed=seed, threads=threads, input_directory=folder)
     if _module() is None:
-        return _render_in_child(Path(scene_path), options, progress)
+        given = {"spp": spp, "seed": seed, "threads": threads, "input_directory": folder}
+        return render_in_child(Path(scene_path), given, progress)
     session = _load(Path(scene_path), options)
     if _render_passes(session, Path(scene_path), options, None, progress):
         raise KeyboardInterrupt
@@ -183,82 +160,6 @@ def drive(
     return rendered(session.take_buffers())
 
 
-def render_to_folder(arguments: Sequence[str]) -> int:
-    """Serve `render` inside the native command: render, and leave the buffers in a folder.
-
-    The arguments are the command's private flag, the folder, a file descriptor for progress, the scene and
-    the options as JSON. Returns the exit status.
-    """
-    _, folder, descriptor, scene, options = arguments
-    with os.fdopen(int(descriptor), "w", buffering=1) as pipe:
-
-        def progress(fraction: float, message: str) -> None:
-            pipe.write(f"{fraction} {message}\n")
-
-        try:
-            buffers = render(scene, **json.loads(options), progress=progress)
-        except InputError as error:
-            Path(folder, "error").write_text(str(error))
-            return 2
-    arrays: dict[str, Any] = {
-        f"{name}.{plane}": array for name, buffer in buffers.quantities() for plane, array in buffer.planes()
-    }
-    np.savez(Path(folder, "buffers.npz"), spp=np.asarray(buffers.spp), **arrays)
-    Path(folder, "attributes").write_text(json.dumps(buffers.attributes))
-    return 0
-
-
-_INTERRUPTED = (130, -signal.SIGINT)
-"""How a child ends that Ctrl-C reached as well."""
-
-
-def _render_in_child(scene: Path, options: DriverOptions, progress: Progress) -> RenderBuffers:
-    command = _require_executable()
-    names = ("spp", "seed", "threads", "input_directory")
-    given = {name: value for name, value in asdict(options).items() if name in names}
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        read_end, write_end = os.pipe()
-        lines = stack.enter_context(os.fdopen(read_end))
-        with os.fdopen(write_end, "w"):
-            program = [
-                str(command),
-                "--dip-render-buffers",
-                folder,
-                str(write_end),
-                str(scene),
-                json.dumps(given, default=str),
-            ]
-            child = stack.enter_context(subprocess.Popen(program, env=_environment(), pass_fds=[write_end]))
-        try:
-            for line in lines:
-                fraction, _, message = line.rstrip("\n").partition(" ")
-                progress(float(fraction), message)
-            status = child.wait()
-        except BaseException:
-            child.terminate()
-            raise
-        if status in _INTERRUPTED:
-            raise KeyboardInterrupt
-        if status:
-            error = Path(folder, "error")
-            raise InputError(
-                error.read_text() if error.exists() else f"{scene}: Tungsten ended with status {status}"
-            )
-        with np.load(Path(folder, "buffers.npz")) as arrays:
-            buffers: dict[str, Any] = {
-                name: Buffer(**{plane: arrays[f"{name}.{plane}"] for plane in _planes(arrays.files, name)})
-                for name in CHANNELS
-                if f"{name}.mean" in arrays.files
-            }
-            spp = arrays["spp"]
-        attributes = json.loads(Path(folder, "attributes").read_text())
-    return RenderBuffers(**buffers, spp=spp if spp.ndim else float(spp), attributes=attributes)
-
-
-def _planes(files: Sequence[str], name: str) -> list[str]:
-    return [file.removeprefix(f"{name}.") for file in files if file.startswith(f"{name}.")]
-
-
 def _load(scene: Path, options: DriverOptions) -> Any:
     module = _require_module()
     if not scene.is_file():
@@ -304,7 +205,9 @@ def _render_passes(
     total = max(session.total_spp, 1)
     while not session.done:
         progress(session.current_spp / total, f"{session.current_spp}/{total} spp")
-        with _deferred_interrupt() as interrupt_requested:
+        with requested_interrupts(
+            "stopping after this pass; Ctrl-C again stops at once and saves nothing"
+        ) as interrupt_requested:
             try:
                 session.render_pass()
             except RuntimeError as error:
@@ -332,30 +235,6 @@ def _resume(session: Any, scene: Path) -> None:
         _LOG.info("resuming at %d spp", session.current_spp)
     else:
         _LOG.info("no saved state of this scene with all buffers: starting at 0 spp")
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn a first Ctrl-C into a request that can be asked for; a second one ends the process.
-
-    Only the main thread can handle signals; elsewhere nothing changes.
-    """
-    requested = False
-
-    def request(_signal: int, _frame: object) -> None:
-        nonlocal requested
-        requested = True
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        _LOG.warning("stopping after this pass; Ctrl-C again stops at once and saves nothing")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    previous = signal.signal(signal.SIGINT, request)
-    try:
-        yield lambda: requested
-    finally:
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
 
 
 def _buffers(plan: Any, arrays: _Arrays) -> RenderBuffers:
@@ -390,15 +269,3 @@ def _require_module() -> Any:
     if module is None:
         raise InputError(f"Tungsten cannot render in this process; {BUILD_HINT}")
     return module
-
-
-def _require_executable() -> Path:
-    command = executable()
-    if command is None:
-        raise InputError(f"Tungsten is not there; {BUILD_HINT}")
-    return command
-
-
-def _environment() -> dict[str, str]:
-    """The native command's Python is this one."""
-    return {**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable}
