@@ -67,9 +67,8 @@ def test_noise_of_each_channel_is_split_as_it_is_correlated() -> None:
     color = np.array([0.2, 0.5, 0.9], np.float32)
     for independent in (True, False):
         noise = rng.gamma(4, 1 / 4, (90, 120, 3 if independent else 1))
-        split = with_independent_halves(RenderBuffers(Buffer((color * noise).astype(np.float32))), (), 0, 2)[
-            0
-        ]
+        noisy = RenderBuffers(Buffer((color * noise).astype(np.float32)))
+        split = with_independent_halves(noisy, (), 0, 2).buffers
         assert split.color.halves is not None
         a, b = (half / color - 1 for half in split.color.halves)
         for first in range(3):
