@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, main_thread
@@ -27,7 +29,7 @@ from tungsten_dip.fit.pilots import (
     guidance_of_halves,
 )
 from tungsten_dip.fit.pointwise import Examples
-from tungsten_dip.fit.training import Training, _batches, train
+from tungsten_dip.fit.training import Training, _batches
 
 
 def _settings(**changes: Any) -> FitSettings:
@@ -358,12 +360,22 @@ def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRe
     assert 1 <= result.iterations < 1000
 
 
+@pytest.fixture
+def _sigint_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT, also where a background job was started with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
     render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told = []
+
     def until_given_up(*arguments: Any) -> tuple[FloatImage, ...]:
         *before, given_up = arguments
-        assert given_up.wait(timeout=60)
+        told.append(given_up.wait(timeout=60))
         made = pilots_of_all_samples(*before, given_up)
         assert made == ()
         return made
@@ -375,6 +387,7 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
     monkeypatch.setattr(fusion, "pilots_of_all_samples", until_given_up)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2, iterations=100_000), interrupt)
     _check(result, render.buffers)
+    assert told == [True]
     assert result.interrupted
 
 
@@ -400,27 +413,33 @@ def test_strands_before_nothing_are_found_by_alpha() -> None:
     )
 
 
+@pytest.mark.usefixtures("_sigint_interrupts")
+@pytest.mark.parametrize("waits", [True, False])
 def test_ctrl_c_after_the_training_leaves_what_was_trained(
-    render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+    waits: bool, render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trained = Event()
+    """Whether the main thread waits for the pilots of all samples by then, or is about to."""
+    waiting, told = Event(), []
 
-    def train_first(*arguments: Any) -> Training:
-        training = train(*arguments)
-        trained.set()
-        return training
+    def wait_or_interrupt(*arguments: Any, **options: Any) -> Any:
+        waiting.set()
+        if not waits:
+            signal.raise_signal(signal.SIGINT)
+        return wait(*arguments, **options)
 
     def after_training(*arguments: Any) -> tuple[FloatImage, ...]:
-        assert trained.wait(timeout=60)
-        # Python raises it in the main thread, which waits for this one.
-        signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
-        assert arguments[-1].wait(timeout=60)
+        told.append(waiting.wait(timeout=60))
+        if waits:
+            # Python raises it in the main thread, which waits for this one.
+            signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
+        told.append(arguments[-1].wait(timeout=60))
         return pilots_of_all_samples(*arguments)
 
-    monkeypatch.setattr(fusion, "train", train_first)
+    monkeypatch.setattr(fusion, "wait", wait_or_interrupt)
     monkeypatch.setattr(fusion, "pilots_of_all_samples", after_training)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2))
     _check(result, render.buffers)
+    assert told == [True, True]
     assert result.interrupted
     assert result.iterations == 30
     assert "interrupted: the image is made of the halves alone" in result.notes

@@ -9,7 +9,7 @@ preserved.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 
@@ -44,6 +44,8 @@ _BATCH_PIXELS = 1 << 14
 _SMALL_BATCH_PIXELS = 1 << 13
 """Enough for the pilots of draft, and beside a previous frame; with more of them the rims of lamps, few
 pixels, come out worse."""
+
+_POLL_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -160,27 +162,32 @@ def _trained(
     ``whole_pilots`` is to return none once the event that it is given is set: Ctrl-C ends both early.
     """
     given_up = Event()
+    training: Training | None = None
     # The network keeps one core busy; the pilots of all samples take what is left of all of them.
     with ThreadPoolExecutor(1) as beside:
         pending = beside.submit(whole_pilots, given_up)
         try:
             if start.evidence.threads == 1:
-                wait([pending])
+                _wait_for(pending)
             steps = settings.iterations or preset.steps
             training = train(network, start, settings, steps, preset.batch_pixels, clock, progress)
-        except BaseException:
+            if training.interrupted:
+                given_up.set()
+            _wait_for(pending)
+        except BaseException as error:
             given_up.set()
-            raise
-        if training.interrupted:
-            given_up.set()
-        try:
-            images = pending.result()
-        except KeyboardInterrupt:
-            given_up.set()
-            images = ()
+            if training is None or not isinstance(error, KeyboardInterrupt):
+                raise
             training.interrupted = True
             training.notes.append("interrupted: the image is made of the halves alone")
-    return training, images
+            return training, ()
+    return training, pending.result()
+
+
+def _wait_for(pending: Future[tuple[FloatImage, ...]]) -> None:
+    """Wait in short turns: a Ctrl-C just before a wait would be noticed at its end only."""
+    while not wait([pending], timeout=_POLL_S).done:
+        pass
 
 
 def _fused(
