@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,10 @@ from moving_camera import write_frames
 from tungsten_dip.buffers import read_buffers, read_image, write_image
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.fit.model import source_sha256
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.onnx import load_model
 from tungsten_dip.sequence import work
+from tungsten_dip.sequence.frames import find_frames
 
 COUNT = 4
 PROGRAM = [
@@ -91,6 +94,50 @@ def test_finished_frames_are_skipped_and_changed_ones_are_not(frames, capsys):
     assert changed == ["f0001.exr", "f0002.exr"]
     assert main(arguments("--refit", "0")) == 0
     assert all(second[name] != content for name, content in outputs(frames).items())
+
+
+RUN = work.Run(FitSettings("draft", iterations=1, threads=1))
+
+
+def other_version(monkeypatch):
+    monkeypatch.setattr(work.metadata, "version", lambda _: "0.0.0")
+    return RUN
+
+
+def touched(path):
+    os.utime(path, ns=(1, 1))
+    return RUN
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda _: touched("noisy/f0000/normalB.exr"),
+        lambda _: touched("cameras/f0000.json"),
+        other_version,
+        lambda _: replace(RUN, settings=replace(RUN.settings, seed=1)),
+        lambda _: replace(RUN, refit=2),
+        lambda _: replace(RUN, mapping={"visibility": "none"}),
+        lambda _: replace(RUN, half=True),
+        lambda _: replace(RUN, warm_start="0123abcd"),
+    ],
+)
+def test_a_frame_is_done_again_where_anything_that_made_it_has_changed(frames, monkeypatch, changed):
+    (frame,) = find_frames("noisy/f####", "out/f####.exr", (0,), "cameras/f####.json")
+    work.denoise_frames([frame], RUN)
+    assert work.finished(frame, RUN) is not None
+    assert work.finished(frame, changed(monkeypatch)) is None
+
+
+def test_a_frame_that_was_skipped_is_none_to_flicker_against(frames):
+    several = find_frames("noisy/f####", "out/f####.exr", (0, 1, 2), "cameras/f####.json")
+    first, _ = work.denoise_frames(several, RUN)
+    assert [record.flicker is not None for record in first] == [False, True, True]
+    for frame in (several[0], several[2]):
+        frame.output.unlink()
+    again, _ = work.denoise_frames(several, RUN)
+    assert [record.skipped for record in again] == [False, True, False]
+    assert again[2].flicker is None
 
 
 def test_other_threads_are_no_reason_to_do_it_again(frames):
