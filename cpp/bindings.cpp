@@ -1,4 +1,5 @@
-// The Python module _core: the one file that knows pybind11. Arrays are shared with numpy, never converted.
+// The Python module _core: the one file that knows pybind11. Arrays are shared with numpy, never converted;
+// their types and shapes are checked here, all else by the core.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -50,23 +51,24 @@ Image image_from_array(const std::string& name, const py::array& array) {
 
 using OptionalArray = std::optional<py::array>;
 
-// Takes arrays for a buffer and checks that they fit together.
+// Takes an array, if there is one, that is to have the shape of another.
+Image image_in_shape_of(const py::array& other, const std::string& name, const OptionalArray& array) {
+    if (!array) return {};
+    const Image image = image_from_array(name, *array);
+    if (!array->attr("shape").equal(other.attr("shape"))) {
+        throw py::value_error(name + ": expected the shape of the others, " +
+                              std::string(py::str(other.attr("shape"))) + ", got " +
+                              std::string(py::str(array->attr("shape"))));
+    }
+    return image;
+}
+
 Buffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a, const OptionalArray& half_b,
                           const OptionalArray& variance) {
-    Buffer buffer{.mean = image_from_array("mean", mean), .half_a = {}, .half_b = {}, .variance = {}};
-    const auto take = [&](const std::string& name, const OptionalArray& array, Image& image) {
-        if (!array) return;
-        image = image_from_array(name, *array);
-        if (!array->attr("shape").equal(mean.attr("shape"))) {
-            throw py::value_error(name + ": expected the shape of the others, " +
-                                  std::string(py::str(mean.attr("shape"))) + ", got " +
-                                  std::string(py::str(array->attr("shape"))));
-        }
-    };
-    take("half_a", half_a, buffer.half_a);
-    take("half_b", half_b, buffer.half_b);
-    take("variance", variance, buffer.variance);
-    return buffer;
+    return {.mean = image_from_array("mean", mean),
+            .half_a = image_in_shape_of(mean, "half_a", half_a),
+            .half_b = image_in_shape_of(mean, "half_b", half_b),
+            .variance = image_in_shape_of(mean, "variance", variance)};
 }
 
 Array array_like(const Image& image) { return Array({image.height, image.width, image.channels}); }
@@ -106,19 +108,16 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
 
 HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_b,
                                  const OptionalArray& variance, int threads) {
-    const Buffer buffer = buffer_from_arrays(half_a, half_a, half_b, variance);
+    const Image image_a = image_from_array("half_a", half_a);
+    const Image image_b = image_in_shape_of(half_a, "half_b", half_b);
+    const Image variance_image = image_in_shape_of(half_a, "variance", variance);
     const py::gil_scoped_release release;
-    return compare_halves(buffer.half_a, buffer.half_b, buffer.variance, threads);
+    return compare_halves(image_a, image_b, variance_image, threads);
 }
 
 py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_a, const py::array& half_b,
                                    const OptionalArray& variance, int radius, int step, float k,
                                    int threads) {
-    if (radius < 0 || step < 1 || radius % step != 0 || !(k > 0)) {
-        throw py::value_error(
-            "expected a radius that is a multiple of the step, no negative one, and k above 0, got " +
-            std::to_string(radius) + ", " + std::to_string(step) + " and " + std::to_string(k));
-    }
     const Buffer in = buffer_from_arrays(mean, half_a, half_b, variance);
     const std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
                                       array_like(in.mean)};
@@ -232,7 +231,10 @@ py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, co
                                    const Array& bias, float epsilon, float slope, const Numbers& y,
                                    const Array& mean, const Array& scale) {
     const NormAct norm = norm_from_arrays(x, weight, bias, epsilon, slope);
-    if (y.size() != x.size() || gradient.size() != x.size() || mean.size() != x.shape(1) ||
+    const auto in_shape_of_x = [&](const Numbers& image) {
+        return image.ndim() == 2 && image.shape(0) == x.shape(0) && image.shape(1) == x.shape(1);
+    };
+    if (!in_shape_of_x(y) || !in_shape_of_x(gradient) || mean.size() != x.shape(1) ||
         scale.size() != x.shape(1)) {
         throw py::value_error(
             "expected outputs and gradients in the shape of x, and moments of its channels");

@@ -473,6 +473,11 @@ void regress(ConstImage target, ConstImage features, const float* penalty, Const
         throw std::invalid_argument(
             "the window's radius must be a multiple of its step, and no radius negative");
     }
+    if (!(window.k > 0) || !(window.ridge >= 0))
+        throw std::invalid_argument("k must be above 0, and the ridge not negative");
+    const auto valid = [](float value) { return value >= 0 && std::isfinite(value); };
+    if (!std::all_of(penalty, penalty + features.channels, valid))
+        throw std::invalid_argument("penalties must be finite, and none negative");
     if (target.size() == 0) return;
     Regression(target, features, penalty, guide, guide_variance, window, threads).run(out);
 }

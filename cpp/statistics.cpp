@@ -205,6 +205,7 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 
 void box_mean(ConstImage in, int radius, Image out, int threads) {
     if (radius < 0) throw std::invalid_argument("the radius must not be negative");
+    radius = std::min(radius, std::max(in.height, in.width));  // coordinates must not overflow
     std::vector<float> pixels(static_cast<std::size_t>(in.size()));
     const Image across{
         .data = pixels.data(), .height = in.height, .width = in.width, .channels = in.channels};

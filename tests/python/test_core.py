@@ -84,10 +84,19 @@ def test_shapes_must_agree() -> None:
     with pytest.raises(ValueError, match="variance: expected the shape"):
         _core.compare_halves(image, image, other)
     with pytest.raises(ValueError, match="quantity: expected color, albedo"):
+    with pytest.raises(TypeError, match=r"^half_a: expected an aligned"):
+        _core.compare_halves(image.astype(np.float64), image, None)  # type: ignore[arg-type]
         _core.sanitize("colour", image, None, None, None)
 
 
 def test_sane_buffers_are_shared(render: SyntheticRender) -> None:
+def test_the_gradient_of_a_norm_takes_images_of_one_shape_alone() -> None:
+    x, three = np.zeros((2, 3), np.uint16), np.ones(3, np.float32)
+    for y, gradient in ((x, x.T.copy()), (x.T.copy(), x), (x, x.ravel())):
+        with pytest.raises(ValueError, match="in the shape of x"):
+            _core.norm_act_gradient(gradient, x, three, three, 1e-5, 0.2, y, three, three)
+
+
     for _, buffer in render.buffers.quantities():
         for _, array in buffer.planes():
             if buffer is not render.buffers.normal:
@@ -326,7 +335,9 @@ def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
         _smoothed(image, image, along=0, across=0.3)
 
 
-@pytest.mark.parametrize("window", [{"radius": -1}, {"radius": 5, "step": 2}, {"step": 0}, {"k": 0.0}])
+@pytest.mark.parametrize(
+    "window", [{"radius": -1}, {"radius": 5, "step": 2}, {"step": 0}, {"k": 0.0}, {"k": np.nan}]
+)
 def test_a_window_that_cannot_be_searched_is_refused(window):
     image = np.ones((4, 5, 3), np.float32)
     with pytest.raises(ValueError, match="expected a radius that is a multiple of the step"):

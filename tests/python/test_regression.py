@@ -244,8 +244,22 @@ def test_windows_that_cannot_be_are_refused(window: dict[str, int]) -> None:
         _core.regress(images["target"], images["features"], (0.0,) * 4, **{"radius": 2, **window})
 
 
+@pytest.mark.parametrize("number", [{"k": 0.0}, {"k": np.nan}, {"ridge": -1.0}, {"ridge": np.nan}])
+def test_numbers_that_no_weight_can_come_of_are_refused(number: dict[str, float]) -> None:
+    images = _images(4, 4)
+    with pytest.raises(ValueError, match="k must be above 0, and the ridge not negative"):
+        _core.regress(images["target"], images["features"], (0.0,) * 4, radius=2, **number)
+
+
+@pytest.mark.parametrize("penalty", [np.nan, np.inf, -1.0])
+def test_penalties_that_no_weight_can_come_of_are_refused(penalty: float) -> None:
+    images = _images(4, 4)
+    with pytest.raises(ValueError, match="penalties must be finite"):
+        _core.regress(images["target"], images["features"], (0.0, 0.0, 0.0, penalty), radius=2)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 5), (4, 0), (20, 33)])
-@pytest.mark.parametrize("radius", [0, 1, 4, 50])
+@pytest.mark.parametrize("radius", [0, 1, 4, 50, 2**31 - 1])
 def test_box_mean_is_the_mean_of_the_pixels_around(size: tuple[int, int], radius: int) -> None:
     image = np.random.default_rng(4).uniform(size=(*size, 2)).astype(np.float32)
     expected = np.empty(image.shape)
