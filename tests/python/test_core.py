@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -83,13 +84,12 @@ def test_shapes_must_agree() -> None:
         _core.compare_halves(image, other, None)
     with pytest.raises(ValueError, match="variance: expected the shape"):
         _core.compare_halves(image, image, other)
-    with pytest.raises(ValueError, match="quantity: expected color, albedo"):
     with pytest.raises(TypeError, match=r"^half_a: expected an aligned"):
         _core.compare_halves(image.astype(np.float64), image, None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="quantity: expected color, albedo"):
         _core.sanitize("colour", image, None, None, None)
 
 
-def test_sane_buffers_are_shared(render: SyntheticRender) -> None:
 def test_the_gradient_of_a_norm_takes_images_of_one_shape_alone() -> None:
     x, three = np.zeros((2, 3), np.uint16), np.ones(3, np.float32)
     for y, gradient in ((x, x.T.copy()), (x.T.copy(), x), (x, x.ravel())):
@@ -97,6 +97,7 @@ def test_the_gradient_of_a_norm_takes_images_of_one_shape_alone() -> None:
             _core.norm_act_gradient(gradient, x, three, three, 1e-5, 0.2, y, three, three)
 
 
+def test_sane_buffers_are_shared(render: SyntheticRender) -> None:
     for _, buffer in render.buffers.quantities():
         for _, array in buffer.planes():
             if buffer is not render.buffers.normal:
@@ -267,6 +268,44 @@ def test_the_structure_tensor_of_a_slope_is_the_product_of_its_gradients(angle: 
     inner = tensor[10:-10, 10:-10]
     # The derivative's kernel is cut off at 3 pixels.
     np.testing.assert_allclose(inner, np.broadcast_to(expected, inner.shape), atol=0.05)
+
+
+def _smoothed_plainly(image: FloatImage, tensor: FloatImage, along: float, across: float) -> np.ndarray:
+    """Return what `_core.smooth_along_edges` is to return, straight from its definition."""
+    height, width = image.shape[:2]
+    radius = int(np.ceil(2 * max(along, across)))
+
+    def moved(planes: FloatImage, dy: int, dx: int) -> np.ndarray:
+        padded = np.pad(planes.astype(np.float64), ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+        return padded[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
+
+    xx, yy, xy = moved(tensor, 0, 0).transpose(2, 0, 1)
+    trace = np.maximum(xx + yy, 1e-12)
+    coherence = np.hypot(xx - yy, 2 * xy) / trace
+    sigma = np.maximum(along * coherence**2, across)
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    total, weights = np.zeros(image.shape), np.zeros((height, width, 1))
+    for dy, dx in itertools.product(range(-radius, radius + 1), repeat=2):
+        u, v = np.cos(angle) * dy - np.sin(angle) * dx, np.cos(angle) * dx + np.sin(angle) * dy
+        apart = ((moved(tensor, dy, dx) - tensor) ** 2) @ (1, 1, 2)
+        distance = u**2 / (2 * sigma**2) + v**2 / (2 * across**2) + 1.5 * apart / trace**2
+        weight = np.exp(-distance)[:, :, None]
+        total += weight * moved(image, dy, dx)
+        weights += weight
+    return total / weights
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (21, 70)])
+@pytest.mark.parametrize("features", ["noise", "edges"])
+def test_smoothing_along_edges_is_what_it_is_defined_as(size: tuple[int, int], features: str) -> None:
+    rng = np.random.default_rng(3)
+    image = rng.random((*size, 3), np.float32)
+    # Where all edges of a block have one direction, most of its neighbours are left out.
+    guide = rng.random((*size, 2), np.float32) if features == "noise" else 0 * image
+    guide[:, 3::16] = 1
+    tensor = _core.structure_tensor(guide)
+    smooth = _core.smooth_along_edges(image, tensor, along=3, across=0.5)
+    np.testing.assert_allclose(smooth, _smoothed_plainly(image, tensor, 3, 0.5), atol=2e-5)
 
 
 def _half_plane(angle: float, size: int = 41) -> FloatImage:
