@@ -95,7 +95,7 @@ struct BufferDefects {
     [[nodiscard]] bool any() const { return mean.any() || half_a.any() || half_b.any() || variance.any(); }
 };
 
-BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads);
+[[nodiscard]] BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads);
 
 // Replaces every defect in place; images without defects are not written to.
 // - negative values become 0, and so does an infinite depth: the ray left the scene. Negative radiance of up
@@ -127,7 +127,8 @@ struct HalvesTest {
     std::int64_t pixels_used = 0;
     bool independent = false;  // false as well where nothing in the image tells
 };
-HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads);
+[[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
+                                        int threads);
 
 // --- prefilter.cpp
 

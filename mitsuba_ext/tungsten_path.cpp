@@ -303,6 +303,7 @@ class TungstenPath final : public Variant::Integrator {
             std::ranges::any_of(quantities_, [](Quantity quantity) { return quantity != color; });
     }
 
+    // Python reads it while threads store it: a float in memory is the old one or the new one.
     void traverse(TraversalCallback* callback) override {
         callback->put("progress", progress_, ParamFlags::NonDifferentiable);
     }

@@ -165,7 +165,8 @@ struct Render::Impl {
     void save_as_asked(const OutputBuffer<T>& buffer, const OutputBufferSettings& settings) const;
 };
 
-Render::Render(const std::string& scene_path, const RenderOptions& options) : impl_(new Impl) {
+Render::Render(const std::string& scene_path, const RenderOptions& options)
+    : impl_(std::make_unique<Impl>()) {
     initialize_libraries();
     use_threads(options.threads);
     // Tungsten keeps its own idea of the current folder, from when the process started.
