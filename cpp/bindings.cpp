@@ -260,6 +260,8 @@ PYBIND11_MODULE(_core, module) {
     using namespace tungsten_dip;  // NOLINT(google-build-using-namespace): a scope of declarations alone
     module.doc() = "The core of tungsten-dip in C++. _core.pyi documents it; use tungsten_dip.buffers.";
 
+    module.attr("INFINITE_DEPTH") = infinite_depth;
+
     py::class_<Defects>(module, "Defects")
         .def_readonly("nan", &Defects::nan)
         .def_readonly("infinite", &Defects::infinite)

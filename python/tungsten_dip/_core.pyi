@@ -13,6 +13,9 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Quantity
 
+INFINITE_DEPTH: float
+"""A depth from here on counts as infinite: the sky."""
+
 class Defects:
     """How many values of an image no renderer can have meant."""
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from tungsten_dip import _core
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
 from tungsten_dip.buffers.model import FEATURES, RenderBuffers
 from tungsten_dip.fit.result import FitResult, HistoryPoint
@@ -20,8 +21,6 @@ from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import TonemapName
 
 _CURVE_HEIGHT = 260
-_SKY_DEPTH = 1e9
-"""The depth from which `buffers.sanitize` treats it as infinite (cpp/sanitize.cpp)."""
 
 
 def report_page(
@@ -64,7 +63,7 @@ def _features(buffers: RenderBuffers) -> Iterator[Picture]:
         if name == "color":
             continue
         if name == "depth":
-            values = np.where(values < _SKY_DEPTH, values, np.float32(0))
+            values = np.where(values < _core.INFINITE_DEPTH, values, np.float32(0))
             values = np.minimum(values, np.float32(np.percentile(values, 99) or np.inf))
         ldr = ldr_from_radiance(values) if name == "albedo" else ldr_from_feature(name, values)
         yield Picture(name, np.ascontiguousarray(np.broadcast_to(ldr, (*values.shape[:2], 3))))
