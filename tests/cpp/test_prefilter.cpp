@@ -131,6 +131,13 @@ void leaves_clean_values_alone() {
     CHECK(clean.mean == render.mean && clean.half_a == render.half_a && clean.half_b == render.half_b);
     CHECK(clean.variance == Pixels(70, 30, 1));
 
+    // Noise below a thousandth of a value is none.
+    for (int y = 0; y < 70; ++y) {
+        for (int x = 0; x < 30; ++x) render.half_a.at(y, x) *= 1 + 4e-4F * static_cast<float>(x % 2);
+    }
+    const Output nearly_clean(render, 1);
+    CHECK(nearly_clean.mean == render.mean && nearly_clean.half_a == render.half_a);
+
     render.half_a.at(2, 2) += 0.1F;  // noise elsewhere changes nothing here
     render.variance.at(2, 2) = 0.0025F;
     Output one_noisy(render, 1);

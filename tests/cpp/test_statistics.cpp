@@ -102,20 +102,80 @@ void shared_samples_fail() {
     }
 }
 
-void texture_is_no_correlation() {
-    Render render(100, 99, 16, 8, normal);
+// Few tiles tell the correlation badly: what chance explains is no evidence.
+void few_pixels_accuse_nobody() {
+    for (unsigned seed = 20; seed < 60; ++seed) {
+        Render render(40, 40, 16, seed, normal);
+        CHECK(compare(render, false).independent);
+    }
+}
+
+// Adds the same detail to both halves, in the columns from `first` on.
+void add_texture(Render& render, double contrast, int first = 0) {
     Generator generator(9);  // NOLINT(bugprone-random-generator-seed): tests repeat
-    for (int y = 0; y < 100; ++y) {
-        for (int x = 0; x < 99; ++x) {
-            const auto detail = static_cast<float>(10 * std::abs(normal(generator)));
+    for (int y = 0; y < render.mean.height; ++y) {
+        for (int x = first; x < render.mean.width; ++x) {
+            const auto detail = static_cast<float>(contrast * std::abs(normal(generator)));
             render.half_a.at(y, x) += detail;
             render.half_b.at(y, x) += detail;
         }
     }
+}
+
+void texture_is_no_correlation() {
+    Render render(100, 99, 16, 8, normal);
+    add_texture(render, 10);
     const HalvesTest test = compare(render, true);
     CHECK(test.correlation > 0.9);
     CHECK(test.independent);
     CHECK(!compare(render, false).independent);  // nobody can tell without the variance
+}
+
+// Where nobody can tell, halves are used unless they agree so well that they are of no use.
+void halves_that_agree_too_well_are_of_no_use() {
+    for (const auto& [contrast, correlation] : {std::pair{1.2, 0.8}, std::pair{2.5, 0.94}}) {
+        Render render(100, 99, 16, 8, normal);
+        add_texture(render, contrast);
+        CHECK(near(compare(render, false).correlation, correlation, 0.03));
+        CHECK(compare(render, false).independent == (correlation < 0.9));
+    }
+}
+
+void textured_tiles_are_left_aside() {
+    Render render(128, 130, 16, 13, normal);
+    add_texture(render, 10, 73);
+    CHECK(near(compare(render, false).correlation, 0, 0.1));
+    CHECK(compare(render, false).independent);
+}
+
+// Halves that differ by the rounding of half floats alone are as alike as their texture.
+void rounding_is_no_noise() {
+    Render render(128, 130, 16, 14, normal);
+    Generator generator(15);  // NOLINT(bugprone-random-generator-seed): tests repeat
+    for (int y = 0; y < 128; ++y) {
+        for (int x = 0; x < 89; ++x) {
+            const double value = 1 + 0.02 * normal(generator);
+            for (Pixels* half : {&render.half_a, &render.half_b})
+                half->at(y, x) = static_cast<float>(value + 0x1p-12 * normal(generator) / 2);
+        }
+    }
+    CHECK(near(compare(render, false).correlation, 0, 0.2));
+    CHECK(compare(render, false).independent);
+}
+
+// A half float that holds few of its smallest steps is off by a large part of itself.
+void variances_of_few_steps_tell_nothing() {
+    Render render(100, 99, 16, 16, normal);
+    const double dark = std::sqrt(0.7 * 0x1p-24 * 16);  // its variance is 0.7 steps in the mean
+    for (int y = 0; y < 100; ++y) {
+        for (int x = 0; x < 50; ++x) {
+            for (Pixels* half : {&render.half_a, &render.half_b})
+                half->at(y, x) = static_cast<float>(dark * half->at(y, x));
+            const double steps = std::round(dark * dark * render.variance.at(y, x) / 0x1p-24);
+            render.variance.at(y, x) = static_cast<float>(steps * 0x1p-24);
+        }
+    }
+    CHECK(near(compare(render, true).variance_ratio, 1, 0.06));
 }
 
 void nothing_to_see_is_not_independent() {
@@ -145,7 +205,12 @@ int main() {
     independent_halves_pass();
     mirrored_halves_fail();
     shared_samples_fail();
+    few_pixels_accuse_nobody();
     texture_is_no_correlation();
+    halves_that_agree_too_well_are_of_no_use();
+    textured_tiles_are_left_aside();
+    rounding_is_no_noise();
+    variances_of_few_steps_tell_nothing();
     nothing_to_see_is_not_independent();
     threads_do_not_matter();
     return failed_checks();
