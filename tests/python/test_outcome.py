@@ -1,0 +1,77 @@
+"""What a result's error is estimated from, on images whose error is known, and when it is the input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from conftest import SyntheticRender
+from tungsten_dip.buffers.model import Buffer, FloatArray, Halves
+from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.outcome import estimate_error, held_out_error
+
+PIXELS = 10_000
+TRUTH = 1.0
+RELATIVE = 1 / (TRUTH**2 + 0.01)
+
+
+def _constant(value: float) -> Halves:
+    image = np.full((PIXELS, 3), value, np.float32)
+    return image, image
+
+
+def _noisy(sigma: float, seed: int) -> Halves:
+    rng = np.random.default_rng(seed)
+    a, b = (np.float32(TRUTH + sigma * rng.standard_normal((PIXELS, 3))) for _ in range(2))
+    return a, b
+
+
+def _mean_estimate(pilots: list[Halves], fused: Halves) -> float:
+    errors: FloatArray = estimate_error(pilots, 1.0, *fused)
+    assert errors.shape == (PIXELS,)
+    return float(errors.mean(dtype=np.float64))
+
+
+def test_where_the_halves_tell_nothing_the_bias_is_one_and_a_half_times_that_of_the_median_pilot() -> None:
+    pilots = [_noisy(30, seed=0), *(_constant(TRUTH + apart) for apart in (0.1, -0.2, 0.3))]
+    assert _mean_estimate(pilots, _constant(TRUTH)) == pytest.approx(1.5 * 0.2**2 * RELATIVE, rel=1e-3)
+
+
+def test_pilots_that_blur_prove_no_bias_that_the_halves_deny() -> None:
+    """The true error is 0: no more than some standard errors of what the halves tell may be claimed."""
+    sigma = 0.1
+    pilots = [_noisy(sigma, seed=1), *(_constant(TRUTH + 0.5) for _ in range(3))]
+    standard_error = sigma**2 / np.sqrt(3 * PIXELS) * RELATIVE
+    assert _mean_estimate(pilots, _constant(TRUTH)) < 8 * standard_error
+
+
+def test_what_the_halves_tell_contains_the_variance() -> None:
+    pilots = [_noisy(0.05, seed=2), *(_constant(TRUTH + 0.5) for _ in range(3))]
+    sigma = 0.1
+    assert _mean_estimate(pilots, _noisy(sigma, seed=3)) == pytest.approx(sigma**2 / 2 * RELATIVE, rel=0.1)
+
+
+@pytest.mark.parametrize(("sigma", "bias"), [(0.1, 0.2), (30, 0.2)])
+def test_the_held_out_error_is_told_by_the_halves_or_where_they_are_too_noisy_by_the_smallest_pilot(
+    sigma: float, bias: float
+) -> None:
+    """Of the two, the other one would be far off."""
+    smallest = _constant(TRUTH) if sigma > 1 else _constant(TRUTH + 5)
+    error = held_out_error([_noisy(sigma, seed=4), smallest], *_constant(TRUTH + bias))
+    assert error == pytest.approx(bias**2 / ((TRUTH + bias) ** 2 + 0.01), rel=0.05)
+
+
+def test_an_input_as_good_as_what_is_fitted_to_it_is_returned(render: SyntheticRender) -> None:
+    """Detail in every pixel that no feature shows, and little noise: every pilot blurs it."""
+    rng = np.random.default_rng(5)
+    truth = rng.uniform(0.1, 2, render.reference.shape)
+    a, b = (np.float32(truth * (1 + 0.02 * rng.standard_normal(truth.shape))) for _ in range(2))
+    variance = np.float32((0.02 * truth) ** 2 / 2)
+    buffers = render.buffers.with_quantities(color=Buffer((a + b) / 2, a, b, variance))
+    result = denoise(buffers, FitSettings("draft", iterations=1, threads=1))
+    assert "the input is as good as anything fitted to it, and is returned" in result.notes
+    np.testing.assert_array_equal(result.color, buffers.color.mean)
+    assert result.halves is not None
+    np.testing.assert_array_equal(result.halves, (a, b))
+    noise = np.mean((a - b) ** 2 / 4 / (buffers.color.mean**2 + 0.01))
+    assert result.estimated_relmse == pytest.approx(noise, rel=1e-3)
