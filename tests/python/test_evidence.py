@@ -1,0 +1,61 @@
+"""What a fit knows of an image's noise before it begins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import MakeRender
+from tungsten_dip.buffers.model import Buffer, Halves, RenderBuffers
+from tungsten_dip.fit import FitSettings, denoise, evidence, training
+from tungsten_dip.fit.evidence import Evidence, unscaled
+from tungsten_dip.fit.pilots import PilotMaker
+from tungsten_dip.fit.planes import loss_weights
+
+
+def test_guides_are_as_noisy_as_is_said_of_them(
+    make_render: MakeRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of all samples have half the noise of those of one half: how renders differ tells."""
+    makers: list[PilotMaker] = []
+
+    def recorded(*arguments: Any, **options: Any) -> PilotMaker:
+        makers.append(PilotMaker(*arguments, **options))
+        return makers[-1]
+
+    monkeypatch.setattr(evidence, "PilotMaker", recorded)
+    for seed in range(4):
+        denoise(make_render(20, 28, seed=seed).buffers, FitSettings("balanced", iterations=1, threads=1))
+    for images in (2, 1):
+        guides = [maker.guides for maker in makers if len(maker.colors) == images]
+        assert len(guides) == 4
+        true = np.var([guide.images[0] for guide in guides], axis=0, ddof=1).mean()
+        said = np.mean([guide.noise for guide in guides])
+        assert said == pytest.approx(true, rel=0.3)
+
+
+def test_pixels_count_less_where_the_noise_is_heavy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the left a relative variance of 0.01, on the right of 9: one part in 1 + 9 of the weight."""
+    shape = np.where(np.arange(80) < 40, 100, 1 / 9)[None, :, None] * np.ones((40, 1, 3))
+    rng = np.random.default_rng(0)
+    a, b = (rng.gamma(shape, 1 / shape).astype(np.float32) for _ in range(2))
+    weights: list[Halves] = []
+
+    def recorded(known: Evidence) -> Halves:
+        weights.append(loss_weights(known))
+        return weights[-1]
+
+    monkeypatch.setattr(training, "loss_weights", recorded)
+    denoise(RenderBuffers(Buffer((a + b) / 2, a, b)), FitSettings("draft", iterations=1, threads=1))
+    ((of_a, of_b),) = weights
+    for weight in (of_a, of_b):
+        calm, heavy = np.median(weight[:, 4:30]), np.median(weight[:, 50:-4])
+        assert 0.03 < heavy / calm < 0.3
+
+
+def test_radiance_that_the_renderers_units_cannot_hold_is_the_largest_number() -> None:
+    largest = np.finfo(np.float32).max
+    image = np.array([[[1.0, 1e15, 0.0]]], np.float32)
+    np.testing.assert_allclose(unscaled(image, 2.0**-100), [[[2.0**100, largest, 0]]], rtol=1e-6)

@@ -1,0 +1,83 @@
+"""What a network is trained on, how fast, and with how many members."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import MakeRender, SyntheticRender
+from tungsten_dip.fit import FitSettings, denoise, fusion, training
+from tungsten_dip.fit.evidence import Evidence, Indices
+from tungsten_dip.fit.pointwise import HIDDEN, Examples, PointwiseNetwork
+from tungsten_dip.fit.training import LEARNING_RATE
+
+
+def test_the_pixels_that_tell_the_error_are_not_trained_on(
+    render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    probed, trained = [], []
+    pilots_at, batches = Evidence.pilots_at, training._batches
+
+    def probed_at(evidence: Evidence, pixels: Indices) -> Any:
+        probed.append(pixels)
+        return pilots_at(evidence, pixels)
+
+    def batches_of(examples: Examples, pixels: Indices, *rest: Any) -> Iterator[Examples]:
+        trained.append(pixels)
+        return batches(examples, pixels, *rest)
+
+    monkeypatch.setattr(Evidence, "pilots_at", probed_at)
+    monkeypatch.setattr(training, "_batches", batches_of)
+    denoise(render.buffers, FitSettings("draft", iterations=1, threads=1))
+    assert len(probed) == len(trained) == 1
+    assert len(probed[0]) == 40 * 56 // 8
+    assert sorted([*probed[0], *trained[0]]) == list(range(40 * 56))
+
+
+class _Clock:
+    """Each time it is asked, another fiftieth of the budget is spent."""
+
+    def __init__(self, budget_s: float | None) -> None:
+        self._asked = 0
+
+    def seconds(self) -> float:
+        return 0.0
+
+    def share_spent(self) -> float:
+        self._asked += 1
+        return self._asked / 50
+
+
+def test_steps_get_smaller_towards_the_end_of_the_time_budget(
+    render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates: list[float] = []
+    step = PointwiseNetwork.step
+
+    def recorded(network: PointwiseNetwork, batch: Examples, learning_rate: float) -> None:
+        rates.append(learning_rate)
+        step(network, batch, learning_rate)
+
+    monkeypatch.setattr(PointwiseNetwork, "step", recorded)
+    monkeypatch.setattr(fusion, "Clock", _Clock)
+    result = denoise(
+        render.buffers, FitSettings("draft", iterations=10**6, time_budget_s=1.0, threads=1, device="cpu")
+    )
+    assert any("the time budget is spent" in note for note in result.notes)
+    assert len(rates) > 20
+    assert max(rates) > 0.8 * LEARNING_RATE
+    assert rates[10:] == sorted(rates[10:], reverse=True)
+    assert rates[-1] < 0.02 * LEARNING_RATE
+
+
+@pytest.mark.parametrize(("time_budget_s", "members"), [(None, 4), (1e6, 1)])
+def test_final_has_one_member_under_a_time_budget(
+    time_budget_s: float | None, members: int, make_render: MakeRender
+) -> None:
+    settings = FitSettings("final", iterations=1, time_budget_s=time_budget_s, threads=1)
+    model = denoise(make_render(16, 24).buffers, settings).model
+    assert model is not None
+    assert np.shape(model.weights["layer1.bias"]) == (members * HIDDEN,)
