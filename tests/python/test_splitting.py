@@ -81,3 +81,20 @@ def test_noise_of_each_channel_is_split_as_it_is_correlated() -> None:
             else:
                 # There is hardly a difference.
                 assert max(hue_a.std(), hue_b.std()) < 0.3 * a.std()
+
+
+def test_lamps_in_plain_view_are_in_both_halves_and_stray_light_is_not() -> None:
+    """The rims of lamps differ from their surroundings as single bright samples do."""
+    emitted = np.zeros((96, 96), np.float32)
+    emitted[4::12, 4::12] = emitted[4::12, 5::12] = emitted[5::12, 4::12] = emitted[5::12, 5::12] = 100
+    lamps = emitted > 0
+    emitted[10::12, 10::12], emitted[10::12, 11::12] = 100, 1
+    stray = (emitted == 100) & ~lamps
+    color, albedo = ((emitted + base)[:, :, None].repeat(3, axis=2) for base in (0.2, 0.5))
+    albedo[emitted > 0] += 0.5
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1).buffers
+    assert split.color.half_a is not None
+    share = (split.color.half_a / (2 * color)).mean(axis=2)
+    torn = (share < 0.1) | (share > 0.9)
+    assert torn[lamps].mean() < 0.02
+    assert torn[stray].mean() > 0.5
