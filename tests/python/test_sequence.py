@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,9 @@ from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera
+from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
-from tungsten_dip.sequence.following import Follower, Models
+from tungsten_dip.sequence.following import Follower, Models, _typical_error
 from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
 from tungsten_dip.sequence.reprojection import check_camera, reproject
 
@@ -159,17 +159,90 @@ def test_dark_surfaces_beside_black_ones_are_not_lit_up(tmp_path):
         np.testing.assert_allclose(moved, 0.01, rtol=0.2)
 
 
-def test_a_camera_that_stands_still_moves_nothing(tmp_path):
+@pytest.mark.parametrize("lens", ["pinhole", "thinlens"])
+def test_a_camera_that_stands_still_moves_nothing(tmp_path, lens):
     frame = true_frame(tmp_path, 0.1, seed=0)
+    camera = frame.camera
+    if lens == "thinlens":
+        # Its pixels' middles are elsewhere (`scene.types`).
+        camera = ThinlensCamera(**{f.name: getattr(camera, f.name) for f in fields(camera) if f.init})
+    moved, _ = reproject(
+        (frame.reference, frame.reference), frame.buffers, camera, frame.buffers, camera, threads=2
+    )
+    np.testing.assert_allclose(moved, frame.reference, rtol=1e-3)
+
+
+def test_a_scaled_camera_sees_the_same(tmp_path):
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.3))
+    truth = before.reference, before.reference
+    moved = [
+        reproject(
+            truth,
+            before.buffers,
+            replace(before.camera, world_from_local=np.asarray(before.camera.world_from_local) @ scale),
+            now.buffers,
+            replace(now.camera, world_from_local=np.asarray(now.camera.world_from_local) @ scale),
+            threads=2,
+        )[0]
+        for scale in (np.eye(4), np.diag([2.0, 3.0, 0.5, 1.0]))
+    ]
+    np.testing.assert_allclose(moved[1], moved[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize(("factor", "same"), [(1.01, True), (1.04, False), (0.96, False)])
+def test_surfaces_are_told_apart_by_a_few_percent_of_their_distance(tmp_path, factor, same):
+    frame = true_frame(tmp_path, 0.0, seed=0)
+    depth = frame.buffers.depth.mean.copy()
+    depth[12, 24] *= np.float32(factor)
     moved, _ = reproject(
         (frame.reference, frame.reference),
-        frame.buffers,
+        frame.buffers.with_quantities(depth=Buffer(depth)),
         frame.camera,
         frame.buffers,
         frame.camera,
         threads=2,
     )
-    np.testing.assert_allclose(moved, frame.reference, rtol=1e-3)
+    assert np.isfinite(moved[12, 24]).all() == same
+    assert np.isfinite(moved).all(axis=2).sum() >= WIDTH * HEIGHT - 1
+
+
+def test_a_sliver_of_a_pixel_is_not_taken_for_a_surface(tmp_path):
+    """Single pixels show the surface: each is seen where it makes up a quarter, not all around it."""
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.3))
+    depth = 2 * before.buffers.depth.mean
+    alone = np.zeros((HEIGHT, WIDTH), bool)
+    alone[14::4, 2::4] = True
+    depth[alone] /= 2
+    moved, _ = reproject(
+        (before.reference, before.reference),
+        before.buffers.with_quantities(depth=Buffer(depth)),
+        before.camera,
+        now.buffers,
+        now.camera,
+        threads=2,
+    )
+    seen = np.isfinite(moved[:, :, 0]) & (now.buffers.depth.mean[:, :, 0] > 0)
+    # (1 - x) (1 - y) >= 1/4 holds on an area of 1.6 pixels of 4.
+    assert 1.2 < seen.sum() / alone.sum() < 2.0
+
+
+def test_the_sky_is_not_what_stood_before_it(tmp_path):
+    """Features but the depth are left out: it alone tells."""
+    now = true_frame(tmp_path, 0.0, seed=0)
+    buffers = now.buffers.with_quantities(albedo=None, normal=None)
+    depth = now.buffers.depth.mean.copy()
+    sky = depth[:, :, 0] == 0
+    depth[:, :24][sky[:, :24]] = 3
+    moved, _ = reproject(
+        (now.reference, now.reference),
+        buffers.with_quantities(depth=Buffer(depth)),
+        now.camera,
+        buffers,
+        now.camera,
+        threads=2,
+    )
+    assert np.isnan(moved[:, :24][sky[:, :24]]).all()
+    assert np.isfinite(moved[:, 24:][sky[:, 24:]]).all()
 
 
 def test_the_sky_moves_with_its_direction(tmp_path):
@@ -256,6 +329,20 @@ def test_the_halves_tell_the_flicker(bias):
     assert estimate == pytest.approx(true, rel=0.15)
 
 
+def test_halves_too_noisy_to_tell_the_flicker_tell_that_of_the_noise():
+    """Results whose noise is 0.05 each, whatever they were made of."""
+    rng = np.random.default_rng(2)
+    shape = (60, 80, 3)
+    noisy, noisy_before = (
+        tuple(np.float32(0.5 + 30 * rng.standard_normal(shape)) for _ in "ab") for _ in range(2)
+    )
+    fused, before = (
+        tuple(np.float32(0.5 + 0.05 * rng.standard_normal(shape)) for _ in "ab") for _ in range(2)
+    )
+    estimate = estimated_flicker(fused, before, noisy, noisy_before)
+    assert estimate == pytest.approx(0.05**2 / (0.5**2 + 0.01), rel=0.1)
+
+
 # --- One frame after another ---
 
 
@@ -320,6 +407,45 @@ def test_frames_without_cameras_start_from_the_first_ones_network(tmp_path):
     assert relmse(second.result.color, frames[1].reference) < 0.3 * relmse(
         frames[1].buffers.color.mean, frames[1].reference
     )
+
+
+def test_a_frame_of_which_half_is_new_is_no_cut(tmp_path):
+    before, now = (true_frame(tmp_path, shift, seed=n) for n, shift in enumerate((0.0, 1.5)))
+    truth = before.reference, before.reference
+    moved, _ = reproject(truth, before.buffers, before.camera, now.buffers, now.camera, threads=2)
+    assert 0.4 < np.isfinite(moved).mean() < 0.75
+    follower = Follower(replace(DRAFT, iterations=5))
+    follower.denoise(before.buffers, before.camera)
+    assert follower.denoise(now.buffers, now.camera).how == "followed"
+
+
+def test_frames_with_noisy_albedos_follow(tmp_path):
+    """Of one surface, two samples of the albedo differ by more than those of two surfaces may."""
+    follower = Follower(replace(DRAFT, iterations=5))
+    how = []
+    for n in range(2):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        rng = np.random.default_rng(n)
+        truth = frame.buffers.albedo.mean
+        a, b = (np.float32(truth + 0.2 * rng.standard_normal(truth.shape)).clip(0) for _ in range(2))
+        buffers = frame.buffers.with_quantities(albedo=Buffer((a + b) / 2, a, b))
+        how.append(follower.denoise(buffers, frame.camera).how)
+    assert how == ["fitted", "followed"]
+
+
+def test_the_network_of_followed_frames_is_trained_in_full(tmp_path):
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    follower = Follower(replace(DRAFT, iterations=5))
+    followed = [follower.denoise(frame.buffers, frame.camera).result for frame in frames]
+    assert [result.iterations for result in followed] == [5, 240]
+
+
+def test_a_few_outliers_tell_of_no_cut(fitted):
+    error = np.full((20, 30, 1), 0.01, np.float32)
+    error[3:5], error[7, 7] = 0, 1e6
+    assert _typical_error(replace(fitted, error=error)) == pytest.approx(0.01)
+    assert _typical_error(replace(fitted, error=0 * error)) is None
+    assert _typical_error(replace(fitted, error=None)) is None
 
 
 def test_a_cut_is_told_by_what_is_in_sight(tmp_path):

@@ -365,6 +365,17 @@ def test_a_scheduler_without_workers_is_one_line(frames, capsys, monkeypatch):
     assert "has no worker; start one with: dask worker tcp://" in capsys.readouterr().err
 
 
+def test_the_first_two_frames_fit_the_networks_of_all_others(frames, capfd):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as local:
+        assert main(arguments("--scheduler", local.scheduler_address, "--refit", "0", "--json")) == 0
+    iterations = [record["iterations"] for record in told(capfd)["frames"]]
+    assert min(iterations[:2]) > 0
+    assert iterations[2:] == [0, 0]
+
+
 def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatch):
     distributed = pytest.importorskip("distributed")
     from tungsten_dip.sequence import cluster as module
