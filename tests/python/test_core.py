@@ -19,6 +19,7 @@ from tungsten_dip.buffers import (
     prefilter_features,
     sanitize,
 )
+from tungsten_dip.buffers.prefilter import noise_in
 
 SIZES = [(1, 1), (1, 9), (9, 1), (7, 5), (65, 67), (0, 4), (4, 0)]
 
@@ -140,6 +141,18 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
     assert sanitize(mended)[1] == ()
 
 
+@pytest.mark.parametrize(
+    ("plane", "told"), [("mean", "depth"), ("half_a", "depth half A"), ("half_b", "depth half B")]
+)
+def test_the_plane_that_was_mended_is_named(plane: str, told: str, render: SyntheticRender) -> None:
+    depth = render.buffers.depth
+    assert depth is not None
+    planes = {name: np.maximum(array, 0) for name, array in depth.planes()}
+    planes[plane][3, 4] = np.nan
+    _, lines = sanitize(RenderBuffers(render.buffers.color, depth=Buffer(**planes)))
+    assert lines == (f"repaired {told} 1 NaN",)
+
+
 def test_what_negative_lobes_lack_comes_from_the_light_around(render: SyntheticRender) -> None:
     def sharpened(image: FloatImage) -> FloatImage:
         return np.asarray(1.4 * image - 0.2 * (np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)))
@@ -228,6 +241,26 @@ def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRe
     noise = np.mean((buffers.albedo.mean - reference) ** 2)
     # The floor's fine checkers have few equals to average with; on plain surfaces far less is left.
     assert np.mean((filtered.albedo.mean - reference) ** 2) < 0.6 * noise
+
+
+def test_a_mean_below_its_halves_does_not_become_negative() -> None:
+    """As where a negative mean was mended; but normals may be."""
+    half = np.zeros((20, 24, 3), np.float32)
+    half[10, 12] = 1
+    feature = Buffer(0 * half, half, half, np.full_like(half, 0.25))
+    filtered = prefilter_features(RenderBuffers(feature, albedo=feature, normal=feature))
+    assert filtered.albedo is not None
+    assert filtered.normal is not None
+    assert filtered.normal.mean[10, 12].max() < -0.5
+    np.testing.assert_array_equal(filtered.albedo.mean[10, 12], 0)
+
+
+def test_the_noise_of_an_image_is_told_from_its_slopes() -> None:
+    rows, columns = np.indices((90, 120))
+    noise = 0.3 * np.random.default_rng(7).standard_normal((90, 120))
+    image = (2 * rows - columns + noise)[:, :, None].astype(np.float32)
+    inner = noise_in(image, 1)[4:-4, 4:-4]
+    assert inner.mean() == pytest.approx(0.3**2, rel=0.05)
 
 
 def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:

@@ -99,6 +99,10 @@ RENDERERS = {
             "depth": ["ViewLayer.Denoising Depth.Z"],
         },
     ),
+    "blender, composited": (
+        [*rgb("Composite.Combined"), *rgb("ViewLayer.Combined")],
+        {"color": rgb("ViewLayer.Combined")},
+    ),
     "blender, a view layer of the background without features": (
         [
             *rgb("BG.Combined"),
@@ -159,6 +163,10 @@ RENDERERS = {
     "mitsuba, moments": (
         [*"RGBA", *rgb("aov.albedo"), *xyz("aov.nn"), *rgb("m2_aov.albedo"), *xyz("m2_aov.nn")],
         {"color": [*"RGB"], "albedo": rgb("aov.albedo"), "normal": xyz("aov.nn"), "alpha": ["A"]},
+    ),
+    "mitsuba, moments before what they are of": (
+        [*"RGB", *rgb("m2_scene.albedo"), *rgb("scene.albedo")],
+        {"color": [*"RGB"], "albedo": rgb("scene.albedo")},
     ),
     "components in lower case": (["Ci.r", "Ci.g", "Ci.b"], {"color": ["Ci.r", "Ci.g", "Ci.b"]}),
     "grey": (["Y"], {"color": ["Y", "Y", "Y"]}),

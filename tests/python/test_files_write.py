@@ -109,6 +109,13 @@ def mixed_channels() -> Channels:
     }
 
 
+def test_writing_leaves_no_threads_behind(tmp_path: Path) -> None:
+    """A process that forks later must have none."""
+    before = OpenEXR.global_thread_count()
+    write_exr(tmp_path / "a.exr", [Part({"R": noise((64, 64))})], threads=before + 2)
+    assert OpenEXR.global_thread_count() == before
+
+
 def test_everything_of_the_input_passes_through_bit_for_bit(tmp_path: Path) -> None:
     channels = mixed_channels()
     window = np.array([-4, 2], "i"), np.array([-2, 3], "i")
