@@ -10,7 +10,7 @@ import pytest
 from conftest import MakeRender
 from tungsten_dip.buffers.model import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, unscaled
+from tungsten_dip.fit.evidence import Evidence, _noises, unscaled
 from tungsten_dip.fit.pilots import PilotMaker
 from tungsten_dip.fit.planes import loss_weights
 
@@ -53,6 +53,14 @@ def test_pixels_count_less_where_the_noise_is_heavy(monkeypatch: pytest.MonkeyPa
     for weight in (of_a, of_b):
         calm, heavy = np.median(weight[:, 4:30]), np.median(weight[:, 50:-4])
         assert 0.03 < heavy / calm < 0.3
+
+
+def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:
+    """It counts as 20 times the mean of the 17x17 pixels around."""
+    error = np.zeros((40, 40, 1), np.float32)
+    error[20, 20] = 1e6
+    noise, _ = _noises((error, error), 1)
+    assert noise[18, 22, 0] == pytest.approx(20 * (1e6 / 17**2) / (17**2 - 1), rel=1e-3)
 
 
 def test_radiance_that_the_renderers_units_cannot_hold_is_the_largest_number() -> None:

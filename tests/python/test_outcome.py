@@ -51,7 +51,7 @@ def test_what_the_halves_tell_contains_the_variance() -> None:
     assert _mean_estimate(pilots, _noisy(sigma, seed=3)) == pytest.approx(sigma**2 / 2 * RELATIVE, rel=0.1)
 
 
-@pytest.mark.parametrize(("sigma", "bias"), [(0.1, 0.2), (30, 0.2)])
+@pytest.mark.parametrize(("sigma", "bias"), [(0.1, 0.2), (2, 0.2), (30, 0.2)])
 def test_the_held_out_error_is_told_by_the_halves_or_where_they_are_too_noisy_by_the_smallest_pilot(
     sigma: float, bias: float
 ) -> None:

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.fit.pilots import Guidance, Pilot, PilotMaker, first_guides, guidance_of_halves
+from tungsten_dip.fit.pilots import (
+    Guidance,
+    Pilot,
+    PilotMaker,
+    divisor,
+    first_guides,
+    guidance_of_halves,
+)
 
 Plane = np.ndarray
 
@@ -72,6 +79,11 @@ def test_the_rim_of_a_lamp_loses_most_of_its_noise(wall: float) -> None:
             errors.append(np.mean((guidance.smooth_emission - _rgb(30 * cover)) ** 2))
             noise.append(np.mean((guidance.emission - _rgb(30 * cover)) ** 2))
     assert np.mean(errors) < 0.5 * np.mean(noise)
+
+
+def test_what_a_mirror_shows_is_not_divided_by_its_black_albedo() -> None:
+    albedo = np.array([[[0.5] * 3, [0.0] * 3, [0.0005] * 3]], np.float32)
+    np.testing.assert_allclose(divisor(albedo)[0, :, 0], [0.51, 1, 1])
 
 
 def _noisy(truth: Plane, shape: float) -> tuple[FloatImage, FloatImage]:
