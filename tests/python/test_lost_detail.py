@@ -45,6 +45,24 @@ def test_nothing_is_given_back_on_the_word_of_one_half() -> None:
     np.testing.assert_array_equal(given[1], truth)
 
 
+@pytest.mark.parametrize(("pixels", "given_back"), [(2, False), (12, True)])
+def test_nothing_is_given_back_on_the_word_of_a_few_pixels(pixels: int, given_back: bool) -> None:
+    """Both halves may have seen the same rare light by chance."""
+    fused = np.full(SHAPE, 0.2, np.float32)
+    noisy = fused.copy()
+    noisy[5, 5 : 5 + pixels] = 3
+    for image in with_lost_detail((noisy, noisy), (fused, fused)):
+        np.testing.assert_allclose(image, noisy if given_back else fused, rtol=1e-5)
+
+
+def test_detail_is_given_back_to_the_dark_as_well() -> None:
+    fused = np.full(SHAPE, 0.01, np.float32)
+    noisy = fused.copy()
+    noisy[5:8, 5:15] = 0.03
+    for image in with_lost_detail((noisy, noisy), (fused, fused)):
+        np.testing.assert_allclose(image, noisy, rtol=1e-5)
+
+
 @pytest.mark.parametrize("size", [(1, 1, 3), (1, 9, 3), (7, 5, 3)])
 @pytest.mark.parametrize("radiance", [0.0, 0.3, 1e15])
 def test_any_size_and_radiance_stays_finite(size: tuple[int, ...], radiance: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from fitted_models import DRAFT, paper_model
 from tungsten_dip.buffers import Buffer, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, denoise
+from tungsten_dip.fit import FitResult, denoise, training
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx import infer, load_model, save_model
 
@@ -55,6 +56,18 @@ def test_a_warm_start_ends_when_the_error_falls_no_further(
     assert error < 1.25 * cold_error
     # Without settings, those of the model hold.
     assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
+
+
+def test_a_warm_start_that_only_gets_worse_leaves_the_weights_as_they_were(
+    model: Model, next_frame: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = itertools.count(1.0)
+    monkeypatch.setattr(training, "held_out_error", lambda *_: next(errors))
+    again = denoise(next_frame.buffers, replace(DRAFT, iterations=50), warm_start=model)
+    assert 1 < again.iterations < 50
+    assert again.model is not None
+    for name, value in model.weights.items():
+        np.testing.assert_array_equal(again.model.weights[name], value)
 
 
 @pytest.mark.parametrize("by", ["denoise", "infer"])
