@@ -267,6 +267,23 @@ def test_map_settles_the_rest(tmp_path: Path) -> None:
     assert buffers.albedo is None
 
 
+def test_features_are_those_of_the_view_layer_that_the_map_names(tmp_path: Path) -> None:
+    channels = save(
+        tmp_path / "a.exr",
+        *[
+            name
+            for view_layer in ("Back", "Front")
+            for layer in ("Combined", "DiffDir", "DiffCol")
+            for name in rgb(f"{view_layer}.{layer}")
+        ],
+        *xyz("Back.Normal"),
+    )
+    for layer in ("Front.Combined", "front.combined", "Front.DiffDir", ",".join(rgb("Front.Combined"))):
+        buffers = read_buffers(tmp_path / "a.exr", {"color": layer})
+        assert holds(buffers.albedo, channels, *rgb("Front.DiffCol"))
+        assert buffers.normal is None
+
+
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [

@@ -69,22 +69,21 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
     channels: dict[str, tuple[str, ...]] = {}
     color_prefix = ""
     for quantity in CHANNELS:
-        layer: str | None = None
+        layer: str | None
         if quantity in mapping:
             if mapping[quantity] == NOTHING:
                 continue
             channels[quantity] = _mapped(quantity, mapping[quantity], names, layers)
             layer = mapping[quantity]
         else:
-            match = _match(quantity, layers, color_prefix)
-            if match is None and quantity == "color" and _may_be_color(default, layers):
-                match = default, ""
-            if match is None:
+            layer = _match(quantity, layers, color_prefix)
+            if layer is None and quantity == "color" and _may_be_color(default, layers):
+                layer = default
+            if layer is None:
                 continue
-            layer, prefix = match
             channels[quantity] = _ordered(layers[layer])
-            if quantity == "color":
-                color_prefix = prefix
+        if quantity == "color":
+            color_prefix = _view_layer(channels["color"][0])
         _add_planes(channels, quantity, layer, names, layers, mapping)
     if {"Y", "RY", "BY"} <= {name.upper() for name in channels.get("color", ())} | layers.keys():
         raise InputError(
@@ -98,7 +97,7 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
         channels["alpha"] = (alpha,)
     spp = _match("spp", layers, color_prefix)
     if spp is not None:
-        channels["spp"] = _ordered(layers[spp[0]])
+        channels["spp"] = _ordered(layers[spp])
     for key, value in mapping.items():
         if value != NOTHING and key not in channels:
             raise InputError(f"--map {key}={value}: there is no mean that this belongs to; map that too")
@@ -129,11 +128,17 @@ def _layers(names: list[str]) -> Layers:
 _COMPOSITE = "composite."
 
 
-def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] | None:
-    """Find the best layer, and what precedes the alias in its name (a Blender view layer).
+def _view_layer(channel: str) -> str:
+    """Return what precedes the layer in the name of a channel, in lower case, with its dot."""
+    view_layer, dot, _ = channel.lower().rpartition(".")[0].rpartition(".")
+    return view_layer + dot
 
-    Of several view layers, the colour is taken from the one that contains most layers, and features only from
-    the same one: those of others show other objects.
+
+def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
+    """Find the best layer.
+
+    Of several view layers (what precedes the alias in the name), the colour is taken from the one that
+    contains most layers, and features only from the same one: those of others show other objects.
     """
     matches = []
     for layer in layers:
@@ -148,13 +153,13 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> tuple[str, str] 
                 if strange and prefix and color_prefix not in ("", _COMPOSITE):
                     break
                 held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
-                matches.append((strange, rank, -held, layer, prefix))
+                matches.append((strange, rank, -held, layer))
                 break
-    return min(matches)[3:] if matches else None
+    return min(matches)[-1] if matches else None
 
 
 def _may_be_color(layer: str, layers: Layers) -> bool:
-    named_for_another = any(_match(quantity, {layer: {"": ""}}, "") for quantity in CHANNELS)
+    named_for_another = any(_match(quantity, {layer: {"": ""}}, "") is not None for quantity in CHANNELS)
     return len(_ordered(layers.get(layer, {}))) == 3 and not named_for_another
 
 
