@@ -143,7 +143,8 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
     matches = []
     for layer in layers:
         name = layer.lower()
-        if name.startswith(_NO_LAYER) or not _ordered(layers[layer]):
+        count = len(_ordered(layers[layer]))
+        if name.startswith(_NO_LAYER) or count == 0:
             continue
         for rank, alias in enumerate(ALIASES[quantity]):
             if name == alias or (alias and name.endswith("." + alias)):
@@ -153,7 +154,9 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
                 if strange and prefix and color_prefix not in ("", _COMPOSITE):
                     break
                 held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
-                matches.append((strange, rank, -held, layer))
+                # One channel called color may be an id, beside the three that are the colour.
+                too_few = count < CHANNELS.get(quantity, 1)
+                matches.append((strange, too_few, rank, -held, layer))
                 break
     return min(matches)[-1] if matches else None
 
