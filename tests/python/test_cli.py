@@ -476,6 +476,32 @@ def test_a_render_that_the_denoised_picture_would_write_over_is_refused(
     assert renders == []
 
 
+@pytest.mark.parametrize(
+    ("hdr", "buffers", "words"),
+    [
+        ("", [("albedo", "picture.exr")], "picture.exr: named for color and for albedo"),
+        ("c.exr", [("normal", "b.exr"), ("albedo", "./bA.exr")], "bA.exr: named for normalA and for albedo"),
+    ],
+)
+def test_images_that_would_be_written_over_one_another_are_refused(
+    hdr, buffers, words, tmp_path, renders, capfd
+):
+    requests = [
+        {"type": quantity, "hdr_output_file": name, "two_buffer_variance": quantity == "normal"}
+        for quantity, name in buffers
+    ]
+    scene = write_scene(tmp_path / "scene.json", hdr_output_file=hdr, output_buffers=requests)
+    fails(capfd, tungsten.main(["--dip-denoise", str(scene)]), words, "name two files")
+    assert renders == []
+
+
+def test_the_colour_may_be_named_twice(tmp_path, renders):
+    buffers = [{"type": "color", "hdr_output_file": "picture.exr", "two_buffer_variance": True}]
+    scene = write_scene(tmp_path / "scene.json", output_buffers=buffers)
+    assert tungsten.main([str(scene)]) == 0
+    assert {path.name for path in tmp_path.glob("*.exr")} == {"picture.exr", "pictureA.exr", "pictureB.exr"}
+
+
 def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, capfd, monkeypatch):
     calls = []
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
+from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName
 
@@ -40,14 +41,22 @@ class SceneOutputs:
         """Return the outputs with the picture written both displayed and as radiance."""
         return replace(self, ldr=self.ldr or self.beside(".png"), hdr=self.hdr or self.beside(".exr"))
 
-    def files(self) -> Iterator[Path]:
-        """Yield the path of every file."""
-        yield from filter(None, (self.ldr, self.hdr))
+    def files(self) -> Iterator[tuple[Path, str]]:
+        """Yield the path of every file and what it holds."""
+        if self.ldr is not None:
+            yield self.ldr, "the picture"
+        if self.hdr is not None:
+            yield self.hdr, "color"
         for request in self.buffers:
-            yield from (path for _, path in _files_of(request))
+            yield from ((path, request.type + PLANES[plane]) for plane, path in _files_of(request))
 
     def check(self) -> None:
-        """Raise InputError if one of the files cannot be written."""
+        """Raise InputError if one of the files cannot be written, or would be written over another one."""
+        held: dict[Path, str] = {}
+        for path, content in self.files():
+            other = held.setdefault(path.resolve(), content)
+            if other != content:
+                raise InputError(f"{path}: named for {other} and for {content}; name two files")
         for path in filter(None, [self.ldr, *(_path(buffer.ldr_output_file) for buffer in self.buffers)]):
             check_writable(path, _LDR)
         for path in filter(None, [self.hdr, *(_path(buffer.hdr_output_file) for buffer in self.buffers)]):

@@ -228,7 +228,7 @@ def _checked_outputs(
     own = _denoised_paths(outputs) if options.dip_denoise else ()
     for file in own:
         check_writable(file, (file.suffix,))
-    rendered, derived = ({file.resolve() for file in files} for files in (outputs.files(), own))
+    rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")
