@@ -412,6 +412,25 @@ def test_files_are_numbered_where_the_scene_forbids_overwriting(tmp_path, render
     }
 
 
+@pytest.mark.parametrize("removed", ["picture.png", "picture.exr", "picture_denoised.exr"])
+def test_the_number_is_free_for_every_picture(removed, tmp_path, renders, fits):
+    scene = write_scene(
+        tmp_path / "scene.json", overwrite_output_files=False, hdr_output_file="", output_buffers=[]
+    )
+    assert tungsten.main(["--dip-denoise", str(scene)]) == 0
+    (tmp_path / removed).unlink()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert tungsten.main(["--dip-denoise", "--seed", "5", str(scene)]) == 0
+    assert {path: path.read_bytes() for path in before} == before
+    assert {path.name for path in tmp_path.iterdir() if path not in before} == {
+        "picture001.png",
+        "picture001.exr",
+        "picture001_denoised.exr",
+        "picture001_denoised.png",
+        "picture001_side_by_side.png",
+    }
+
+
 def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     tmp_path, renders, fits, capfd, monkeypatch
 ):

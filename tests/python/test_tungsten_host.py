@@ -373,6 +373,27 @@ def test_the_command_denoises_and_previews_beside_the_renders_own_files(write_sc
 
 
 @in_process
+def test_tungsten_writes_its_pictures_under_the_names_of_the_denoised_ones(
+    write_scene, tmp_path, monkeypatch
+):
+    def fit(buffers, settings, warm_start=None):
+        return FitResult(color=buffers.color.mean, settings=settings, seconds=0.0, iterations=0)
+
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.denoise_with_progress", fit)
+    monkeypatch.chdir(tmp_path)
+    # Tungsten writes no JPEG, and would number each picture by itself.
+    arguments = ["--host", "tungsten", "--dip-denoise", "-d", "out"]
+    arguments.append(str(write_scene(overwrite_output_files=False, output_file="a.jpg")))
+    names = ("a{}.png", "picture{}.pfm", "a{}_denoised.exr", "a{}_denoised.png", "a{}_side_by_side.png")
+    for number in ("", "001"):
+        assert main(arguments) == 0
+        written = {path.name for path in Path("out").iterdir()}
+        assert {name.format(number) for name in names} <= written
+        (tmp_path / "out" / "a.png").unlink(missing_ok=True)
+    assert "a.png" not in written
+
+
+@in_process
 def test_interrupting_saves_the_outputs_of_the_passes_so_far(write_scene, tmp_path, caplog):
     path = write_scene(camera={"resolution": [80, 48]}, spp=100_000, spp_step=8)
     options = tungsten.DriverOptions(threads=2, output_directory=tmp_path / "out")

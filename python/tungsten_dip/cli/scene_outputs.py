@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -41,6 +42,25 @@ class SceneOutputs:
         """Return the outputs with the picture written both displayed and as radiance."""
         return replace(self, ldr=self.ldr or self.beside(".png"), hdr=self.hdr or self.beside(".exr"))
 
+    def denoised(self) -> tuple[Path, Path, Path]:
+        """Return the paths of the denoised EXR and PNG, and of the noisy picture side by side with it."""
+        names = ("_denoised.exr", "_denoised.png", "_side_by_side.png")
+        exr, png, pair = (self.beside(name) for name in names)
+        return exr, png, pair
+
+    def numbered(self, denoise: bool) -> SceneOutputs:
+        """Return the outputs with the first number (none, 001, 002, ...) under which no picture exists.
+
+        As with Tungsten, buffers get no number. Numbers of Tungsten's may differ between the two pictures.
+        """
+        for index in itertools.count():
+            ldr, hdr = (_numbered(path, index) for path in (self.ldr, self.hdr))
+            outputs = replace(self, ldr=ldr, hdr=hdr)
+            pictures = [*filter(None, (ldr, hdr)), *(outputs.denoised() if denoise else ())]
+            if not any(path.exists() for path in pictures):
+                break
+        return outputs
+
     def files(self) -> Iterator[tuple[Path, str]]:
         """Yield the path of every file and what it holds."""
         if self.ldr is not None:
@@ -76,8 +96,7 @@ def scene_outputs(
     own_folder = output_directory or Path.cwd()
 
     def placed(own: Path | None, name: str) -> Path | None:
-        path = own_folder / own if own else folder / name if name else None
-        return path if path is None or renderer.overwrite_output_files else _unused(path)
+        return own_folder / own if own else folder / name if name else None
 
     buffers = tuple(
         replace(
@@ -140,10 +159,6 @@ def _path(name: str) -> Path | None:
     return Path(name) if name else None
 
 
-def _unused(path: Path) -> Path:
-    """Return the path, or the first of ``name001``, ``name002``, ... that does not exist."""
-    candidate, index = path, 0
-    while candidate.exists():
-        index += 1
-        candidate = path.with_name(f"{path.stem}{index:03d}{path.suffix}")
-    return candidate
+def _numbered(path: Path | None, index: int) -> Path | None:
+    """Return ``name001.exr`` and so on, the path itself for number 0."""
+    return path.with_name(f"{path.stem}{index:03d}{path.suffix}") if path is not None and index else path

@@ -63,7 +63,7 @@ def write_outputs(
     These are ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked
     for, the report and the fitted network. ``remarks`` are lines on the render for the report.
     """
-    exr, png, pair = _denoised_paths(outputs)
+    exr, png, pair = outputs.denoised()
     noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))
     write_denoised(exr, result, buffers)
     write_image(png, denoised)
@@ -197,7 +197,7 @@ def _render_scene(
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
-                buffers, unwritten = _render_with_tungsten(path, outputs, options, settings, progress)
+                buffers, unwritten = _render_with_tungsten(scene, outputs, options, settings, progress)
             else:
                 buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
         write_render(buffers, unwritten, scene.camera.tonemap)
@@ -224,8 +224,10 @@ def _checked_outputs(
     )
     if options.dip_denoise:
         outputs = outputs.with_both_pictures()
+    if not scene.renderer.overwrite_output_files:
+        outputs = outputs.numbered(options.dip_denoise)
     outputs.check()
-    own = _denoised_paths(outputs) if options.dip_denoise else ()
+    own = outputs.denoised() if options.dip_denoise else ()
     for file in own:
         check_writable(file, (file.suffix,))
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
@@ -247,7 +249,7 @@ def _checked_outputs(
 
 
 def _render_with_tungsten(
-    path: Path,
+    scene: Scene,
     outputs: SceneOutputs,
     options: argparse.Namespace,
     settings: FitSettings,
@@ -256,7 +258,7 @@ def _render_with_tungsten(
     """Render a scene; return its buffers, and what Tungsten has not written of its outputs."""
     preview = _preview(outputs, settings) if options.dip_preview else None
     before = _last_written(outputs.hdr)
-    rendered = tungsten_host.drive(path, _driver_options(options), preview, progress)
+    rendered = tungsten_host.drive(scene.path, _driver_options(options, scene, outputs), preview, progress)
     return rendered.buffers, SceneOutputs(
         ldr=None if rendered.output_file else outputs.ldr,
         # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
@@ -306,7 +308,11 @@ def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten
     return write
 
 
-def _driver_options(options: argparse.Namespace) -> tungsten_host.DriverOptions:
+def _driver_options(
+    options: argparse.Namespace, scene: Scene, outputs: SceneOutputs
+) -> tungsten_host.DriverOptions:
+    asked_ldr = options.output_file or scene.renderer.output_file
+    asked_hdr = options.hdr_output_file or scene.renderer.hdr_output_file
     return tungsten_host.DriverOptions(
         threads=options.threads,
         spp=options.spp,
@@ -316,8 +322,9 @@ def _driver_options(options: argparse.Namespace) -> tungsten_host.DriverOptions:
         timeout_s=options.timeout,
         input_directory=options.input_directory,
         output_directory=options.output_directory,
-        output_file=options.output_file,
-        hdr_output_file=options.hdr_output_file,
+        # The names that were checked: Tungsten would place or number some differently.
+        output_file=outputs.ldr.absolute() if asked_ldr and outputs.ldr else None,
+        hdr_output_file=outputs.hdr.absolute() if asked_hdr and outputs.hdr else None,
     )
 
 
@@ -345,9 +352,3 @@ def _timeout_of(scene: Scene) -> float:
         return minutes(scene.renderer.timeout)
     except argparse.ArgumentTypeError as error:
         raise InputError(f"{scene.path}: renderer.timeout: {error}; correct it") from None
-
-
-def _denoised_paths(outputs: SceneOutputs) -> tuple[Path, Path, Path]:
-    names = ("_denoised.exr", "_denoised.png", "_side_by_side.png")
-    exr, png, pair = (outputs.beside(name) for name in names)
-    return exr, png, pair
