@@ -301,19 +301,23 @@ def test_a_folder_of_another_render_is_not_mixed_in(tmp_path: Path, make_render:
         write_tungsten_folder(tmp_path / "file", buffers)
 
 
-def test_half_never_turns_into_infinity(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("scale", [1e-8, 1e6])
+def test_half_never_turns_into_infinity_or_black(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float
+) -> None:
     buffers = RenderBuffers(Buffer(noise((2, 3, 3))))
-    fits, bright = result_for(buffers), result_for(buffers, scale=1e6)
+    fits, other = result_for(buffers), result_for(buffers, scale)
     fits.color[0, 0] = np.inf, 65504, np.nan
+    fits.color[0, 1] = 0, 1e-9, -1e-9
     write_denoised(tmp_path / "a.exr", fits, buffers, float16=True)
     channels = load(tmp_path / "a.exr")[0][1]
     assert channels["R"].dtype == channels["error.Y"].dtype == np.float16
     assert channels["G"][0, 0] == 65504
     assert channels["color.R"].dtype == np.float32
     assert not caplog.text
-    write_denoised(tmp_path / "a.exr", bright, buffers, float16=True)
+    write_denoised(tmp_path / "a.exr", other, buffers, float16=True)
     channels = load(tmp_path / "a.exr")[0][1]
-    assert same_bits(channels["R"], bright.color[..., 0].copy())
+    assert same_bits(channels["R"], other.color[..., 0].copy())
     assert channels["error.Y"].dtype == np.float16
     assert "65504" in caplog.text
 

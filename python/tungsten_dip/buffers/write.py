@@ -31,7 +31,8 @@ from tungsten_dip.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 
-LARGEST_FLOAT16 = 65504.0
+_MOST_LOST = 0.01
+"""The part of an image that half floats may lose: too little to be seen. Rounding loses 1 / 2048 at most."""
 
 _DENOISED_PART = "tungsten_dip denoised"
 
@@ -72,8 +73,8 @@ class Denoised(Protocol):
 def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, float16: bool = False) -> None:
     """Write the denoised picture together with the buffers it was made from (see the top of this file).
 
-    With ``float16``, the picture and the error are stored as 16 bit floats, except where that would turn a
-    value beyond 65504 into infinity. Settings, seed, seconds, iterations, the estimated relMSE and the
+    With ``float16``, the picture and the error are stored as 16 bit floats, unless their values are too large or
+    too small for that. Settings, seed, seconds, iterations, the estimated relMSE and the
     version become attributes.
 
     Raises InputError if the file is no .exr or cannot be written, or the result is of another size than the
@@ -183,10 +184,11 @@ def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
 def _stored(label: str, image: FloatImage, float16: bool) -> Channel:
     if not float16:
         return image
-    if np.any(np.isfinite(image) & (np.abs(image) > LARGEST_FLOAT16)):
-        _LOG.warning(
-            "%s has values beyond %g, the largest 16-bit float: stored as float32", label, LARGEST_FLOAT16
-        )
+    finite = image[np.isfinite(image)]
+    with np.errstate(over="ignore"):
+        lost = np.abs(finite.astype(np.float16) - finite).sum(dtype=np.float64)
+    if lost > _MOST_LOST * np.abs(finite).sum(dtype=np.float64):
+        _LOG.warning("%s is too bright or too dim for half floats (6e-8 to 65504): stored as float32", label)
         return image
     return image.astype(np.float16)
 
