@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import OpenImageIO
 import pytest
 
@@ -113,6 +114,24 @@ def test_denoise_writes_every_file_asked_for(folder, tmp_path, fits, render, cap
     np.testing.assert_allclose(read_image(out), np.broadcast_to(mean, (40, 56, 3)), rtol=1e-6)
     np.testing.assert_array_equal(read_image(error), np.full((40, 56, 3), 0.25, np.float32))
     assert "estimated relMSE" in report.read_text()
+
+
+def test_the_error_map_lies_where_the_picture_lies(tmp_path, render, fits):
+    color = render.buffers.color
+    layers = {
+        f"{layer}{component}": plane[..., index]
+        for layer, plane in (("", color.mean), ("colorA.", color.half_a), ("colorB.", color.half_b))
+        for index, component in enumerate("RGB")
+    }
+    height, width = layers["R"].shape
+    frame = {"dataWindow": ((-16, -8), (width - 17, height - 9)), "displayWindow": ((0, 0), (95, 55))}
+    write_exr(tmp_path / "in.exr", [Part(layers, frame)])
+    paths = {name: str(tmp_path / f"{name}.exr") for name in ("in", "out", "error")}
+    assert command.main(["denoise", paths["in"], "-o", paths["out"], "--error-map", paths["error"]]) == 0
+    for name in ("out", "error"):
+        header = OpenEXR.File(paths[name], header_only=True).parts[0].header
+        for window, corners in frame.items():
+            assert np.array_equal(header[window], corners)
 
 
 def test_json_is_all_there_is_on_stdout(folder, tmp_path, fits, capfd):

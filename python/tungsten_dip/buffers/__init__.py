@@ -8,7 +8,7 @@ from tungsten_dip.buffers.model import CHANNELS, FEATURES, Buffer, FloatImage, R
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.read import read_buffers, read_image
 from tungsten_dip.buffers.sanitize import sanitize
-from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
+from tungsten_dip.buffers.write import write_denoised, write_error_map, write_tungsten_folder
 
 __all__ = [
     "CHANNELS",
@@ -26,6 +26,7 @@ __all__ = [
     "replacing",
     "sanitize",
     "write_denoised",
+    "write_error_map",
     "write_image",
     "write_text",
     "write_tungsten_folder",

@@ -114,12 +114,20 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     if result.estimated_relmse is not None:
         own[OWN + "estimated_relmse"] = result.estimated_relmse
     own |= _spp(buffers)
-    attributes = {**_frame(source), **buffers.attributes, **own}
+    attributes = {**_frame(buffers), **buffers.attributes, **own}
     if single:
         parts = [Part(added | kept, attributes, source.parts[0].name)]
     else:
         parts = [Part(added, attributes, _DENOISED_PART), *source.parts]
     write_exr(path, parts, result.settings.threads)
+
+
+def write_error_map(path: Path, error: FloatImage, buffers: RenderBuffers) -> None:
+    """Write the error of a result, shape (height, width, 1), as float32, with the buffers' data window.
+
+    Raises InputError if the file cannot be written.
+    """
+    write_exr(path, [Part(_channels("", "Y", error), _frame(buffers))])
 
 
 def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:
@@ -130,7 +138,7 @@ def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:
     Raises InputError if the folder cannot be written or holds buffers that this set would not replace.
     """
     folder = Path(folder)
-    frame = _frame(buffers.source) if buffers.source else {}
+    frame = _frame(buffers)
     files: dict[str, Part] = {}
     for quantity, buffer in buffers.quantities():
         names = "RGB" if CHANNELS[quantity] == 3 else "Y"
@@ -172,8 +180,10 @@ def _source_from_buffers(buffers: RenderBuffers) -> Source:
     return Source((Part(channels),))
 
 
-def _frame(source: Source) -> dict[str, Any]:
-    attributes = source.parts[source.color_part].attributes
+def _frame(buffers: RenderBuffers) -> dict[str, Any]:
+    """Return where the pixels were in the file that was read, if any."""
+    source = buffers.source
+    attributes = source.parts[source.color_part].attributes if source else {}
     return {key: value for key, value in attributes.items() if key in FRAME}
 
 

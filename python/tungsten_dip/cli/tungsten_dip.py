@@ -18,7 +18,7 @@ from tungsten_dip.buffers import (
     read_buffers,
     read_image,
     write_denoised,
-    write_image,
+    write_error_map,
 )
 from tungsten_dip.buffers.image_file import first_pixel
 from tungsten_dip.buffers.read import input_files
@@ -205,7 +205,7 @@ def _denoised(
         write_report(options.report, options.input.name, buffers, result, DEFAULT_TONEMAP, remarks)
     if options.error_map is not None:
         assert result.error is not None
-        write_image(options.error_map, result.error)
+        write_error_map(options.error_map, result.error, buffers)
     if options.save_model is not None:
         write_model(options.save_model, result)
 
