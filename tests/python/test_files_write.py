@@ -270,6 +270,44 @@ def test_a_folder_travels_in_half(tmp_path: Path) -> None:
     assert_same(buffers, read_buffers(tmp_path / "out.exr"))
 
 
+def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def layer(name: str, seed: int) -> Channels:
+        return {f"{name}{component}": noise((2, 3), seed + index) for index, component in enumerate("RGB")}
+
+    color = {**layer("", 0), **layer("crypto00.", 3), **layer("Denoising Albedo.", 6), "id": noise((2, 3), 9)}
+    parts = {
+        "rgba": color,
+        "crypto01": layer("", 20),
+        "light": layer("light.", 30),
+        "far": {name: noise((4, 4)) for name in "RGB"},
+    }
+    window = {"displayWindow": ((0, 0), (9, 9))}  # those of the parts must agree
+    save(tmp_path / "color.exr", parts, **{"cryptomatte/1/name": "crypto"}, **window)
+    save(tmp_path / "albedo.exr", {"": {**layer("", 40), **layer("crypto00.", 50)}})
+    with caplog.at_level(logging.INFO):
+        buffers = read_buffers(tmp_path)
+    assert "ignored: color.exr: far, of another size" in caplog.text
+    assert same_bits(buffers.albedo.mean, np.stack(list(layer("", 40).values()), axis=-1))
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, written, header)] = load(tmp_path / "out.exr")
+    expected = {
+        **layer("color.", 0),
+        "color.id": color["id"],
+        **layer("color.Denoising Albedo.", 6),
+        **layer("crypto00.", 3),
+        **layer("crypto01.", 20),
+        **layer("light.", 30),
+        **layer("albedo.", 40),
+        **layer("albedo.crypto00.", 50),
+    }
+    assert written.keys() == expected.keys() | {*"RGB", "error.Y"}
+    assert all(same_bits(written[name], channel) for name, channel in expected.items())
+    assert header["cryptomatte/1/name"] == "crypto"
+    assert_same(buffers, read_buffers(tmp_path / "out.exr"))
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 8), (13, 7)])
 @pytest.mark.parametrize("spp", [None, 16.0, "varies"])
 def test_buffers_of_a_host_become_layers(

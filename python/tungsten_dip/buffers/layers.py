@@ -108,6 +108,12 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
     return Found(channels, ignored)
 
 
+def names_quantity(layer: str) -> bool:
+    """Return whether a layer of this name may be taken for a quantity, or for one of its planes."""
+    matches = any(_match(quantity, {layer: {"": ""}}, "") is not None for quantity in ALIASES)
+    return matches or layer.lower().startswith((*CHANNELS, "variance"))
+
+
 def _layers(names: list[str]) -> Layers:
     """Group channels: layer -> component in upper case -> channel."""
     layers: Layers = {}

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
-from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers
+from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers, names_quantity
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
-from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Part, Source
+from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file
 
@@ -173,18 +173,39 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
 
 def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) -> RenderBuffers:
     """Read one file per plane; each becomes a layer named as Tungsten names its file."""
+    images = {key: read_parts(file) for key, file in files.items()}
+    color = images["color"][0]
+    channels: dict[str, Channel] = {}
+    ignored = list(ignored)
+    for key, (first, *others) in images.items():
+        if first.window != color.window:
+            raise InputError(_sizes_differ(str(files[key]), first, color))
+        fitting = [first]
+        for part in others:
+            if part.window == color.window:
+                fitting.append(part)
+            else:
+                ignored.append(f"{files[key].name}: {part.name}, of another size")
+        channels |= _channels_of_file(key, fitting)
     if ignored:
         _LOG.info("ignored: %s", ", ".join(ignored))
-    parts = {key: read_parts(file)[0] for key, file in files.items()}
-    color = parts["color"]
-    for key, part in parts.items():
-        if part.window != color.window:
-            raise InputError(_sizes_differ(str(files[key]), part, color))
-    channels = {
-        f"{key}.{name}": channel for key, part in parts.items() for name, channel in part.channels.items()
-    }
-    # The layers have the names given here; other channels of a file are kept under its key.
-    return _from_source(path, Source((Part(channels, color.attributes),)), color.attributes)
+    attributes = {key: value for part in reversed(images["color"]) for key, value in part.attributes.items()}
+    return _from_source(path, Source((Part(channels, attributes),)), attributes)
+
+
+def _channels_of_file(key: str, parts: Sequence[Part]) -> dict[str, Channel]:
+    """Return the channels of one file of a folder, by names that are unique in the folder.
+
+    Their layer is ``key``, except for layers of the colour's file that are not named for a quantity: its
+    attributes, which travel with them, refer to some by name (Cryptomatte).
+    """
+    channels = {}
+    for full_name, (part, name) in _full_names(parts).items():
+        unique = name if part is parts[0] else full_name
+        layer = unique.rpartition(".")[0]
+        keeps_name = key == "color" and layer and not names_quantity(layer)
+        channels[unique if keeps_name else f"{key}.{unique}"] = part.channels[name]
+    return channels
 
 
 def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, Any]]:
@@ -258,7 +279,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     )
 
 
-def _full_names(parts: tuple[Part, ...]) -> dict[str, tuple[Part, str]]:
+def _full_names(parts: Sequence[Part]) -> dict[str, tuple[Part, str]]:
     """The part and name of every channel by a name unique in the file: of several parts, each is a layer."""
     names = {}
     for part in parts:
