@@ -184,6 +184,16 @@ def test_the_pictures_place_is_that_of_the_colours_part(tmp_path: Path) -> None:
         write_denoised(tmp_path / "out.exr", result_for(again), again)
 
 
+def test_the_output_does_not_claim_to_be_an_aces_container(tmp_path: Path) -> None:
+    pixels = dict.fromkeys("RGB", noise((2, 3)).astype(np.float16))
+    save(tmp_path / "in.exr", {"": pixels}, acesImageContainerFlag=1, owner="somebody")
+    buffers = read_buffers(tmp_path / "in.exr")
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, _, header)] = load(tmp_path / "out.exr")
+    assert header["owner"] == "somebody"
+    assert "acesImageContainerFlag" not in header
+
+
 def test_what_openexr_cannot_write_is_one_line(tmp_path: Path) -> None:
     part = Part({"R": noise((2, 3), 1)}, {"dataWindow": ((0, 0), (7, 7))})
     with pytest.raises(InputError, match=r"out\.exr: OpenEXR cannot write this \(") as caught:

@@ -37,8 +37,19 @@ _MOST_BYTES = 16 << 30
 
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
-# What the encoder decides anew, or what describes the encoding alone.
-_ENCODING = {"channels", "chunkCount", "compression", "lineOrder", "name", "tiles", "type", "version"}
+# What the encoder decides anew, or what describes the encoding alone. An ACES container is uncompressed and
+# has no layers (SMPTE ST 2065-4).
+_ENCODING = {
+    "acesImageContainerFlag",
+    "channels",
+    "chunkCount",
+    "compression",
+    "lineOrder",
+    "name",
+    "tiles",
+    "type",
+    "version",
+}
 
 
 def read_parts(path: Path) -> tuple[Part, ...]:
