@@ -267,6 +267,26 @@ def test_the_map_is_remembered(tmp_path: Path) -> None:
     assert same_bits(other.color.mean, read_buffers(tmp_path / "in.exr").color.mean)
 
 
+@pytest.mark.parametrize("kept", [["R", "G", "B"], ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B"]])
+def test_a_denoised_picture_without_its_noisy_one_is_a_picture(
+    tmp_path: Path, kept: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    albedo = {f"albedo.{channel}": noise((3, 2), 1) for channel in "RGB"}
+    save(tmp_path / "in.exr", {"": {channel: noise((3, 2)) for channel in "RGB"} | albedo})
+    buffers = read_buffers(tmp_path / "in.exr")
+    result = result_for(buffers)
+    write_denoised(tmp_path / "out.exr", result, buffers)
+    [(_, channels, header)] = load(tmp_path / "out.exr")
+    # As oiiotool --ch does: the attributes stay.
+    write_exr(tmp_path / "rgb.exr", [Part({name: channels[name] for name in kept}, header)])
+    again = read_buffers(tmp_path / "rgb.exr")
+    assert same_bits(again.color.mean, result.color)
+    assert (again.albedo is None) == ("albedo.R" not in kept)
+    assert "no longer" in caplog.text
+    write_denoised(tmp_path / "rgb_denoised.exr", result, again)
+    assert_same(again, read_buffers(tmp_path / "rgb_denoised.exr"))
+
+
 def test_a_folder_travels_in_half(tmp_path: Path) -> None:
     for key, names in (("color", "RGB"), ("colorVariance", "RGB"), ("depth", "Y")):
         save(tmp_path / f"{key}.exr", {"": dict.fromkeys(names, HALF_WITH_NAN_BITS)})

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
-from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, find_layers, names_quantity
+from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, Found, find_layers, names_quantity
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
@@ -229,14 +229,29 @@ def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, A
     restored = Part(
         channels, {key: value for key, value in attributes.items() if not key.startswith(OWN)}, first.name
     )
-    return Source(tuple(part for part in (restored, *others) if part.channels), mapping), attributes
+    source = Source(tuple(part for part in (restored, *others) if part.channels), mapping)
+    try:
+        _find_layers(source)
+    except InputError:
+        # Other tools take channels out, and leave the attributes as they are.
+        _LOG.warning("%s: holds the noisy colour no longer: the denoised one is taken for it", path)
+        return Source((replace(restored, channels=first.channels), *others)), restored.attributes
+    return source, attributes
+
+
+def _find_layers(source: Source) -> tuple[dict[str, tuple[Part, str]], Found]:
+    """Return the part and name of every channel, and what was recognised.
+
+    Raises InputError as `layers.find_layers` does.
+    """
+    owner = _full_names(source.parts)
+    default = source.parts[0].name if len(source.parts) > 1 else ""
+    return owner, find_layers(owner, source.mapping, default)
 
 
 def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> RenderBuffers:
-    owner = _full_names(source.parts)
-    default = source.parts[0].name if len(source.parts) > 1 else ""
     try:
-        found = find_layers(owner, source.mapping, default)
+        owner, found = _find_layers(source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     groups = dict(found.channels)
