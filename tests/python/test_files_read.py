@@ -629,6 +629,36 @@ def test_radiance_pictures_in_another_order_of_pixels_are_refused(tmp_path: Path
         read_image(tmp_path / f"{order}.hdr")
 
 
+def save_radiance(path: Path, header: str) -> None:
+    """Save 2 x 3 pixels of red 1, green 0.5, blue 0.25, before the lines of the header are applied."""
+    text = f"#?RADIANCE\n{header}FORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 3\n"
+    path.write_bytes(text.encode() + bytes([128, 64, 32, 129]) * 6)
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("", (1, 0.5, 0.25)),
+        ("EXPOSURE=          4.0\n", (0.25, 0.125, 0.0625)),
+        ("EXPOSURE=4\nSOFTWARE=a\nEXPOSURE=.5\n", (0.5, 0.25, 0.125)),
+        ("COLORCORR= 2 1 0.5\nEXPOSURE=2\n", (0.25, 0.25, 0.25)),
+    ],
+)
+def test_radiance_pictures_are_read_in_their_own_unit(
+    tmp_path: Path, header: str, expected: tuple[float, ...]
+) -> None:
+    save_radiance(tmp_path / "a.hdr", header)
+    image = read_image(tmp_path / "a.hdr")
+    assert image.dtype == np.float32
+    assert np.array_equal(image, np.broadcast_to(np.array(expected, np.float32), (2, 3, 3)))
+
+
+@pytest.mark.parametrize("line", ["EXPOSURE=0", "EXPOSURE=-1", "EXPOSURE=inf", "EXPOSURE=x", "COLORCORR=1 2"])
+def test_radiance_pictures_without_a_unit_are_refused(tmp_path: Path, line: str) -> None:
+    save_radiance(tmp_path / "a.hdr", f"{line}\n")
+    refused(tmp_path / "a.hdr", "EXPOSURE and COLORCORR above 0|damaged")
+
+
 @pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
 def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> None:
     write_image(tmp_path / "a.png", np.ones((3, 4, 3), np.float32))

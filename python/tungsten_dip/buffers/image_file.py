@@ -20,6 +20,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import replacing
+from tungsten_dip.buffers.model import FloatArray
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -242,10 +243,31 @@ def _part(path: Path, image: Any, index: int) -> Part:
             raise InputError(
                 f"{path}: is damaged or truncated ({_one_line(image.geterror())}); render or copy it again"
             )
+        if path.suffix.lower() == ".hdr":
+            pixels = pixels / _radiance_scale(path)
         planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
         channels.update(zip(spec.channelnames[begin:end], planes, strict=True))
         begin = end
     return Part(channels, name=spec.getattribute("oiio:subimagename") or "")
+
+
+def _radiance_scale(path: Path) -> FloatArray:
+    """Return what the red, green and blue of a readable .hdr file have been multiplied by.
+
+    The product of all EXPOSURE and COLORCORR lines of the header (Ward, "Radiance File Formats"), which
+    OpenImageIO leaves to the reader.
+    """
+    scale = np.ones(3, np.float32)
+    with path.open("rb") as file:
+        for line in file:
+            name, _, values = line.partition(b"=")
+            if not name.strip():  # the end of the header
+                break
+            if name in (b"EXPOSURE", b"COLORCORR"):
+                scale *= np.array(values.split(), np.float32)
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        raise InputError(f"{path}: expected EXPOSURE and COLORCORR above 0, got {scale}; save it as .exr")
+    return scale
 
 
 def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
