@@ -344,6 +344,23 @@ def test_local_workers_do_what_one_does(frames, capsys):
     assert outputs(frames) == before
 
 
+_BLOCKED_SIGNALS = """
+import signal
+from tungsten_dip.sequence.cluster import _client
+
+with _client("local", 2) as client:
+    masks = client.run(lambda: signal.pthread_sigmask(signal.SIG_BLOCK, []))
+    print([signal.SIGINT in mask for mask in masks.values()])
+"""
+
+
+def test_ctrl_c_in_a_terminal_reaches_no_local_worker():
+    pytest.importorskip("distributed")
+    # In a process of its own, that has started no other before.
+    command = [sys.executable, "-c", _BLOCKED_SIGNALS]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[True, True]\n"
+
+
 def test_a_scheduler_that_does_not_answer_is_one_line(frames, capsys, monkeypatch):
     pytest.importorskip("distributed")
     from tungsten_dip.sequence import cluster as module

@@ -13,6 +13,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from multiprocessing import resource_tracker
 from operator import itemgetter
 from typing import Any
 
@@ -164,6 +165,8 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """Keep Ctrl-C back, from the processes that start meanwhile for good: it is this one that ends them."""
+    # It starts with the first of them otherwise, and lets Ctrl-C through in the thread that starts them.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
