@@ -518,6 +518,18 @@ def test_every_truncation_is_refused(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert capfd.readouterr() == ("", ""), "the libraries must not print"
 
 
+def test_a_file_of_several_parts_is_whole_to_its_last_byte_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    save_parts(tmp_path / "whole.exr", color={n: pixels(0) for n in "RGB"}, id={"Y": pixels(1, np.float16)})
+    assert image_file.is_whole(tmp_path / "whole.exr")
+    whole = (tmp_path / "whole.exr").read_bytes()
+    for length in [*range(0, len(whole), 7), len(whole) - 1]:
+        (tmp_path / "cut.exr").write_bytes(whole[:length])
+        assert not image_file.is_whole(tmp_path / "cut.exr")
+    assert capfd.readouterr() == ("", ""), "the libraries must not print"
+
+
 def test_damaged_bytes_read_or_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     save(tmp_path / "whole.exr", *"RGB", *rgb("albedo"), owner="somebody")
     whole = (tmp_path / "whole.exr").read_bytes()

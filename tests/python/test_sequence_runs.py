@@ -88,10 +88,11 @@ def test_finished_frames_are_skipped_and_changed_ones_are_not(frames, capsys):
     assert told.err.count("finished already") == len(first)
     os.utime(frames / "noisy/f0001/color.exr", ns=(1, 1))
     (frames / "out/f0002.exr").write_bytes(first["f0002.exr"][:1000])
+    (frames / "out/f0003.exr").write_bytes(first["f0003.exr"][:-1])
     assert main(arguments()) == 0
     second = outputs(frames)
     changed = [name for name in first if first[name] != second[name]]
-    assert changed == ["f0001.exr", "f0002.exr"]
+    assert changed == ["f0001.exr", "f0002.exr", "f0003.exr"]
     assert main(arguments("--refit", "0")) == 0
     assert all(second[name] != content for name, content in outputs(frames).items())
 

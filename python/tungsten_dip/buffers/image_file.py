@@ -97,6 +97,25 @@ def first_pixel(path: Path) -> tuple[int, int] | None:
     return int(column), int(row)
 
 
+def is_whole(path: Path) -> bool:
+    """Whether every part of an .exr file that was written by rows can be read to its end, its last row."""
+    image = oiio.ImageInput.open(_checked_name(path))
+    if image is None:
+        oiio.geterror()  # is printed at exit otherwise
+        return False
+    try:
+        part = 0
+        while image.seek_subimage(part, 0):
+            spec = image.spec()
+            end = spec.y + spec.height
+            if image.read_scanlines(part, 0, end - 1, end, 0, 0, spec.nchannels, "unknown") is None:
+                return False
+            part += 1
+        return True
+    finally:
+        image.close()
+
+
 def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> None:
     """Write the parts, every channel in its own pixel type, compressed without loss, whole or not at all.
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from typing import Any, Literal
 
-from tungsten_dip.buffers.image_file import read_attributes
+from tungsten_dip.buffers.image_file import is_whole, read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
 from tungsten_dip.buffers.source import OWN
 from tungsten_dip.buffers.write import write_denoised
@@ -76,7 +76,7 @@ def finished(frame: Frame, run: Run) -> Record | None:
         return None
     try:
         stored = json.loads(read_attributes(frame.output)[_RECORD])
-        if stored.pop("key") != key:
+        if stored.pop("key") != key or not is_whole(frame.output):
             return None
         return Record(**{**stored, "number": frame.number, "output": str(frame.output), "skipped": True})
     except (AttributeError, InputError, KeyError, TypeError, ValueError):
