@@ -733,6 +733,20 @@ def test_a_name_that_is_no_text_is_refused_in_a_line(tmp_path, render, capfd):
     assert len(errors.splitlines()) == 1
 
 
+def test_control_characters_of_a_file_do_not_reach_the_terminal(tmp_path, capfd):
+    path = tmp_path / "\x1b[31m.exr"
+    layer = "\x1b]0;title\x07"
+    names = (*"RGB", f"{layer}.U", f"{layer}.V")
+    write_exr(path, [Part(dict.fromkeys(names, np.ones((3, 4), np.float32)))])
+    assert command.main(["inspect", str(path)]) == 0
+    output = str(tmp_path / "out.exr")
+    assert command.main(["denoise", str(path), "-o", output, "--map", f"color={layer}"]) == 2
+    told = "".join(capfd.readouterr())
+    assert r"ignored: \x1b]0;title\x07" in told
+    assert r"color=\x1b]0;title\x07: expected" in told
+    assert not {"\x1b", "\x07"} & set(told)
+
+
 def test_results_with_a_name_that_is_no_text_are_told(folder, tmp_path):
     picture = tmp_path / os.fsdecode(b"bad\xff.exr")
     options = ["denoise", str(folder), "-o", str(picture), "--preset", "draft", "--iterations", "2"]

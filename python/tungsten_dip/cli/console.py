@@ -40,6 +40,8 @@ _NO_MEMORY = (
 )
 """What torch, onnxruntime, the loader of libraries and CPython say in place of raising MemoryError."""
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
 SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 LINE_INTERVAL_S = 5.0
@@ -185,12 +187,20 @@ def minutes(text: str) -> float:
     return duration(text, default_unit="m")
 
 
+def printable(text: str) -> str:
+    """Return a text with its control characters escaped, but for newlines and tabs.
+
+    A terminal obeys those in the names of a file and its layers.
+    """
+    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+
+
 class _StderrHandler(logging.Handler):
     """Writes log lines above a progress bar, if one is being drawn."""
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):
-            tqdm.write(self.format(record), file=sys.stderr)
+            tqdm.write(printable(self.format(record)), file=sys.stderr)
 
 
 @contextmanager
@@ -215,7 +225,7 @@ def _fail(command: str, message: str, status: int) -> int:
 def _tell(line: str) -> None:
     """Print a line on stderr; a full disk or a reader that is gone there must not end the work."""
     with suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
+        print(printable(line), file=sys.stderr, flush=True)
 
 
 def _replace_closed_streams() -> None:

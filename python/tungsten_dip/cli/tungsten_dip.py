@@ -29,6 +29,7 @@ from tungsten_dip.cli.console import (
     add_threads,
     integers,
     json_on_stdout,
+    printable,
     progress_on_stderr,
     run,
 )
@@ -83,7 +84,7 @@ def _run(arguments: Sequence[str] | None) -> None:
 def _print(text: str) -> None:
     encoding = sys.stdout.encoding or "utf-8"
     # Names of files need not be text.
-    print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    print(printable(text).encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
