@@ -29,6 +29,7 @@ from tungsten_dip.fit.pilots import (
     guidance_of_halves,
 )
 from tungsten_dip.fit.pointwise import Examples
+from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.training import Training, _batches
 
 
@@ -792,6 +793,36 @@ def test_a_colour_without_a_sane_pixel_is_told(
     assert "in every pixel" not in caplog.text
     assert denoise(render.buffers.with_quantities(color=Buffer(nothing)), _settings()).color.mean() < 1e-3
     assert "in every pixel" in caplog.text
+
+
+@pytest.mark.parametrize("scale", [3.2, 100, 255])
+@pytest.mark.parametrize("halves", [True, False])
+def test_an_albedo_in_another_scale_is_left_out(
+    scale: float, halves: bool, render: SyntheticRender, caplog: pytest.LogCaptureFixture
+) -> None:
+    planes = {name: plane for name, plane in render.buffers.albedo.planes() if halves or name == "mean"}
+    scaled = Buffer(**{name: plane * np.float32(scale) for name, plane in planes.items()})
+    result = denoise(render.buffers.with_quantities(albedo=scaled), _settings())
+    [warning] = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert "expected 0 to 1" in warning.getMessage()
+    without = denoise(render.buffers.with_quantities(albedo=None), _settings())
+    np.testing.assert_array_equal(result.color, without.color)
+
+
+@pytest.mark.parametrize("radiance", [1.5, 30.0])
+def test_the_albedo_of_a_picture_full_of_light_is_used(
+    radiance: float, render: SyntheticRender, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A wide lamp or a bright sky: its albedo is its radiance, as is its colour."""
+    buffers = {}
+    lit = np.ones((40, 56, 1), bool)
+    lit[10:20] = False
+    for name in ("color", "albedo"):
+        planes = getattr(render.buffers, name).planes()
+        buffers[name] = Buffer(**{plane: np.where(lit, np.float32(radiance), x) for plane, x in planes})
+    known = prepared(render.buffers.with_quantities(**buffers))
+    assert known.buffers.albedo is not None
+    assert not caplog.text
 
 
 def test_small_images_are_no_worse_for_more_pilots(make_render: MakeRender) -> None:

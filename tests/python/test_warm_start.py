@@ -74,10 +74,12 @@ def test_a_warm_start_that_only_gets_worse_leaves_the_weights_as_they_were(
 def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
     by: str, model: Model, frame: SyntheticRender
 ) -> None:
-    albedo = frame.buffers.albedo
+    """All of it is a lamp."""
+    color, albedo = frame.buffers.color, frame.buffers.albedo
     assert albedo is not None
     light = Buffer(*(20 * plane for _, plane in albedo.planes()))
-    unlike = frame.buffers.with_quantities(albedo=light)
+    lit = Buffer(*(a + b for (_, a), (_, b) in zip(color.planes(), light.planes(), strict=True)))
+    unlike = frame.buffers.with_quantities(color=lit, albedo=light)
     if by == "denoise":
         result = denoise(unlike, replace(DRAFT, iterations=20), warm_start=model)
         # Only which pilot the others are compared with is the model's own.

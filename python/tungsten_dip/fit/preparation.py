@@ -17,6 +17,12 @@ from tungsten_dip.fit.result import FitResult
 
 _LOG = logging.getLogger(__name__)
 
+_LARGEST_ALBEDO = 1.1
+"""Of a surface: 1, and what noise and the lobes of a pixel filter add."""
+
+_UNSEEN_SHARE = 0.5
+"""Part of an albedo that may be above that without such light. In renders, mirrors make it 0.03 at most."""
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -36,6 +42,8 @@ def prepared(
 ) -> Prepared:
     """Check and sanitise the input; the arguments are those of `tungsten_dip.denoise`.
 
+    An albedo in another scale is left out.
+
     Raises InputError if the image is empty, or candidates are of another shape or not finite.
     """
     if buffers.color.mean.size == 0:
@@ -48,7 +56,28 @@ def prepared(
     previous = checked_previous(buffers, previous)
     buffers, foreign = without_foreign_halves(buffers)
     buffers, repaired = sanitize(buffers, threads)
+    buffers = _without_albedo_of_another_scale(buffers)
     return Prepared(buffers, given, previous, (*foreign, *repaired))
+
+
+def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
+    """Return buffers without an albedo that is mostly above 1 where the colour shows no such light.
+
+    Above 1 it would be taken for emission. Of a lamp or an environment it is the radiance, which the colour
+    contains; of surfaces in percent, or in 8 bits, it is not.
+    """
+    if buffers.albedo is None:
+        return buffers
+    albedo = buffers.albedo.mean
+    unseen = (albedo > _LARGEST_ALBEDO) & (buffers.color.mean < np.float32(0.5) * albedo)
+    if np.count_nonzero(unseen) <= _UNSEEN_SHARE * np.count_nonzero(albedo):
+        return buffers
+    _LOG.warning(
+        "the albedo is left out: expected 0 to 1, linear, got values up to %.3g; rescale it, or use --map "
+        "albedo=none",
+        albedo.max(),
+    )
+    return buffers.with_quantities(albedo=None)
 
 
 def completed(result: FitResult, known: Prepared) -> FitResult:
