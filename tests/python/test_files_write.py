@@ -11,6 +11,7 @@ import string
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -244,6 +245,20 @@ def test_what_was_changed_since_is_written_as_it_is_now(tmp_path: Path) -> None:
     again = read_buffers(tmp_path / "out.exr")
     assert same_bits(again.color.mean, 2 * buffers.color.mean)
     assert again.depth is None
+
+
+@pytest.mark.parametrize("changed", ["color", "depth", "alpha"])
+def test_images_replaced_after_reading_are_those_written(tmp_path: Path, changed: str) -> None:
+    names = [*"RGBA", "depth.Y", "id"]
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})
+    buffers = read_buffers(tmp_path / "in.exr")
+    other = noise((3, 2, 3 if changed == "color" else 1), 9)
+    changes: dict[str, Any] = {changed: other if changed == "alpha" else Buffer(other)}
+    now = replace(buffers, **changes)
+    write_denoised(tmp_path / "out.exr", result_for(now), now)
+    assert_same(now, read_buffers(tmp_path / "out.exr"))
+    # What is no image leaves the file's other layers where they are.
+    assert replace(buffers, attributes={"owner": "somebody"}).source is buffers.source
 
 
 def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) -> None:

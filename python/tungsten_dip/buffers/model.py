@@ -74,7 +74,7 @@ class RenderBuffers:
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies.
     ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
-    (None for buffers that are not those of a file).
+    (None for buffers that are not, or no longer, those of a file).
 
     Raises InputError if the shapes or the channel counts do not fit together, or an array is not C-contiguous
     float32.
@@ -98,6 +98,11 @@ class RenderBuffers:
         for name, more in (("alpha", self.alpha), ("spp", self.spp)):
             if isinstance(more, np.ndarray):
                 _check(name, more, (*expected, 1))
+        if self.source and any(
+            getattr(self, name) is not self.source.read.get(name) for name in (*CHANNELS, "alpha")
+        ):
+            # `dataclasses.replace` changed an image, and took along the file that does not hold it.
+            object.__setattr__(self, "source", None)
 
     @property
     def height(self) -> int:

@@ -273,7 +273,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     spp = float(spp) if isinstance(spp, (int, float)) and spp > 0 else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
-    buffers = {}
+    buffers: dict[str, Any] = {}
     _LOG.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
     for quantity in CHANNELS:
         known = {field: quantity + suffix for field, suffix in PLANES.items() if quantity + suffix in planes}
@@ -282,15 +282,15 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
             taken = (f"{field} {_shown(groups[key])}" for field, key in known.items())
             _LOG.info("%s: %s", quantity, ", ".join(taken))
     if "alpha" in planes:
+        buffers["alpha"] = planes["alpha"]
         _LOG.info("alpha: %s", groups["alpha"][0])
     if found.ignored:
         _LOG.info("ignored: %s", ", ".join(found.ignored))
     return RenderBuffers(
         **buffers,
         spp=planes.get("spp", spp),
-        alpha=planes.get("alpha"),
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
-        source=replace(source, color_part=color_part),
+        source=replace(source, color_part=color_part, read=buffers),
     )
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from tungsten_dip.buffers.model import Buffer
 
 OWN = "tungsten_dip/"
 """Prefix of the names of our own attributes."""
@@ -51,8 +54,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Source:
-    """The parts of an input file, the --map that assigned its layers, and which part holds the colour."""
+    """The parts of an input file, the --map that assigned its layers, and which part holds the colour.
+
+    ``read`` is what was made of it: the quantities and ``alpha``, by name.
+    """
 
     parts: tuple[Part, ...]
     mapping: Mapping[str, str] = field(default_factory=dict)
     color_part: int = 0
+    read: Mapping[str, Buffer | Channel] = field(default_factory=dict)
