@@ -425,6 +425,19 @@ def test_attributes_that_exr_cannot_hold_do_not_cost_the_result(
     assert "nested" in caplog.text
 
 
+@pytest.mark.parametrize("value", [[1, 2], [True], [[1.0]], 10**12, -(2**31) - 1])
+def test_attributes_that_openexr_would_change_are_left_out_and_told(
+    tmp_path: Path, value: object, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = {"list": [1.5, 2.5], "words": ["a", "b"], "pair": (1, 2), "int": 2**31 - 1, "float": 0.5}
+    write_exr(tmp_path / "a.exr", [Part({"Y": noise((2, 3))}, {**kept, "bad": value})])
+    header = load(tmp_path / "a.exr")[0][2]
+    assert "bad" not in header
+    assert "attribute bad is left out: expected an integer of 32 bits, or a list" in caplog.text
+    for name, expected in kept.items():
+        assert np.array_equal(header[name], expected), name
+
+
 NAME = st.sampled_from(
     ["R", "G", "B", "A", "Y", "Z", "noisy.R", "noisy.G", "noisy_.B", "error.Y", "error", "N.X"]
 )

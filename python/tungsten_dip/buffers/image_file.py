@@ -297,7 +297,15 @@ def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
         try:
             pixel = {"Y": np.zeros((1, 1), np.float32)}
             if name not in ("dataWindow", "displayWindow"):
-                OpenEXR.File({name: value, "type": OpenEXR.scanlineimage}, pixel).write(io.BytesIO())
+                file = io.BytesIO()
+                OpenEXR.File({name: value, "type": OpenEXR.scanlineimage}, pixel).write(file)
+                file.seek(0)
+                # OpenEXR leaves out some lists, and cuts integers to 32 bits, without an error.
+                stored = OpenEXR.File(file, header_only=True).header().get(name)
+                if stored is None or (isinstance(value, int) and stored != value):
+                    raise ValueError(
+                        f"expected an integer of 32 bits, or a list of strings or floats, got {value!r:.40}"
+                    )
             kept[name] = value
         except (RuntimeError, TypeError, ValueError) as error:
             _LOG.warning("attribute %s is left out: %s", name, _one_line(str(error)))
