@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import tungsten_dip as dip
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 
@@ -28,6 +29,29 @@ def unaligned() -> np.ndarray:
 def test_arrays_of_another_kind_are_refused(half, words):
     with pytest.raises(InputError, match=f"^color half_a: {words}"):
         RenderBuffers(Buffer(GREY, half, GREY))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: Buffer(None), "mean: expected ndarray, got NoneType; use numpy.asarray"),
+        (lambda: Buffer(GREY.tolist()), "mean: expected ndarray, got list; "),
+        (lambda: Buffer(GREY, "A", GREY), "half_a: expected ndarray, got str; "),
+        (lambda: RenderBuffers(GREY), r"color: expected Buffer, got ndarray; use Buffer\(array\)"),
+        (lambda: RenderBuffers(None), "color: expected Buffer, got NoneType; "),
+        (lambda: RenderBuffers(Buffer(GREY), albedo=GREY), "albedo: expected Buffer, got ndarray; "),
+        (lambda: RenderBuffers(Buffer(GREY), alpha=[1]), "alpha: expected ndarray, got list; "),
+        (lambda: dip.denoise("kitchen"), "buffers: expected RenderBuffers, got str; read_buffers reads"),
+        (lambda: dip.denoise(RenderBuffers(Buffer(GREY)), "draft"), "settings: expected FitSettings"),
+        (lambda: dip.denoise(RenderBuffers(Buffer(GREY)), warm_start="m.onnx"), "warm_start: expected Model"),
+        (lambda: dip.infer("m.onnx", RenderBuffers(Buffer(GREY))), "model: expected Model, got str; load_"),
+        (lambda: dip.compare(GREY.tolist(), GREY), "image: expected ndarray, got list; read_image reads"),
+        (lambda: dip.compare(GREY, "ref.exr"), "reference: expected ndarray, got str; read_image reads"),
+    ],
+)
+def test_what_is_of_another_type_is_refused(call, words):
+    with pytest.raises(InputError, match=f"^{words}"):
+        call()
 
 
 def test_what_is_asked_for_helps():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 
 if TYPE_CHECKING:
     from tungsten_dip.buffers.source import Source
@@ -35,6 +35,8 @@ CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 
 FEATURES: tuple[Quantity, ...] = ("albedo", "normal", "depth")
 """The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
 
+_AS_ARRAY = "use numpy.asarray(image, numpy.float32)"
+
 
 @dataclass(frozen=True, eq=False)
 class Buffer:
@@ -42,12 +44,18 @@ class Buffer:
 
     ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the
     variance of ``mean`` (not of one sample). All have the shape of ``mean``.
+
+    Raises InputError if one is no array.
     """
 
     mean: FloatImage
     half_a: FloatImage | None = None
     half_b: FloatImage | None = None
     variance: FloatImage | None = None
+
+    def __post_init__(self) -> None:
+        for name, plane in (("mean", self.mean), *self.planes()):
+            check_type(name, plane, np.ndarray, _AS_ARRAY)
 
     @property
     def halves(self) -> Halves | None:
@@ -76,8 +84,8 @@ class RenderBuffers:
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
     (None for buffers that are not, or no longer, those of a file).
 
-    Raises InputError if the shapes or the channel counts do not fit together, or an array is not C-contiguous
-    float32.
+    Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, or an
+    array is not C-contiguous float32.
     """
 
     color: Buffer
@@ -91,6 +99,10 @@ class RenderBuffers:
     source: Source | None = None
 
     def __post_init__(self) -> None:
+        for quantity, buffer in (("color", self.color), *self.quantities()):
+            check_type(quantity, buffer, Buffer, "use Buffer(array)")
+        if self.alpha is not None:
+            check_type("alpha", self.alpha, np.ndarray, _AS_ARRAY)
         expected = self.color.mean.shape[:2]
         for quantity, buffer in self.quantities():
             for plane, array in buffer.planes():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from tungsten_dip.buffers.model import Halves, RenderBuffers
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.preparation import completed, prepared
@@ -73,8 +73,11 @@ def denoise(
     for the preset paper), candidates are of another shape or not finite, or the model does not fit the image
     or the settings.
     """
+    if warm_start is not None:
+        check_type("warm_start", warm_start, Model, "load_model reads one from a file")
     if settings is None:
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
+    check_type("settings", settings, FitSettings, "use FitSettings(preset=...)")
     check_ready(settings, warm_start)
     known = prepared(buffers, candidates, previous, settings.threads)
     if settings.preset == "paper":

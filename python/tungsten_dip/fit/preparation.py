@@ -11,7 +11,7 @@ import numpy as np
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.result import FitResult
 
@@ -44,8 +44,10 @@ def prepared(
 
     An albedo in another scale is left out.
 
-    Raises InputError if the image is empty, or candidates are of another shape or not finite.
+    Raises InputError if these are no buffers or the image is empty, or candidates are of another shape or not
+    finite.
     """
+    check_type("buffers", buffers, RenderBuffers, "read_buffers reads them from files")
     if buffers.color.mean.size == 0:
         raise InputError(f"expected an image of at least one pixel, got {buffers.width}x{buffers.height}")
     if not any(np.isfinite(plane).any() for _, plane in buffers.color.planes()):

@@ -10,7 +10,7 @@ import numpy as np
 from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair, thread_count
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
@@ -53,6 +53,7 @@ def infer(
     Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
     refit_steps cannot be done.
     """
+    check_type("model", model, Model, "load_model reads one from a file")
     if refit_steps < 0:
         raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
     settings = _settings(model, threads, refit_steps)

@@ -12,7 +12,7 @@ import numpy as np
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.model import FloatImage
 from tungsten_dip.buffers.relmse import relative_squared_error
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.extras import requirement
 
 _LOG = logging.getLogger(__name__)
@@ -53,9 +53,11 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     Wang et al. 2004; FLIP is Andersson et al. 2020 and HDR-FLIP theirs of 2021, at 67 pixels per degree. SSIM
     and FLIP need the extra ``compare`` of this package, and are logged as missing without it.
 
-    Raises InputError if the shapes differ or are not of that form, if the image is empty, or if the reference
-    is not finite.
+    Raises InputError if one is no array, if the shapes differ or are not of that form, if the image is empty,
+    or if the reference is not finite.
     """
+    for name, given in (("image", image), ("reference", reference)):
+        check_type(name, given, np.ndarray, "read_image reads one from a file")
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(
             f"compare: expected two images of one shape (height, width, 3), got {image.shape} and "
