@@ -69,7 +69,12 @@ def _resolved(path: Path) -> Path:
 
 
 def _temporary(target: Path) -> Path:
-    return target.with_name(f".{target.stem}-{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
+    return target.with_name(f"{_prefix(target)}{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
+
+
+def _prefix(target: Path) -> str:
+    """Return what the names of temporary files begin with: the stem, cut lest they be too long."""
+    return f".{os.fsencode(target.stem)[:_MOST_OF_STEM_BYTES].decode(errors='ignore')}-"
 
 
 @contextmanager
@@ -92,7 +97,7 @@ def _locked_temporary(target: Path) -> Iterator[Path]:
 def _remove_left_by_the_dead(target: Path) -> None:
     """Remove temporary files of ``target`` whose writers live no more: these alone are not locked."""
     name = re.compile(
-        re.escape(f".{target.stem}-") + f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}" + re.escape(target.suffix)
+        re.escape(_prefix(target)) + f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}" + re.escape(target.suffix)
     )
     with suppress(OSError):
         for path in target.parent.iterdir():
@@ -103,4 +108,5 @@ def _remove_left_by_the_dead(target: Path) -> None:
 
 
 _TOKEN_BYTES = 4
+_MOST_OF_STEM_BYTES = 100
 _REMEDY = "choose an existing folder that you may write to, on a disk with room"
