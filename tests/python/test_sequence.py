@@ -9,7 +9,10 @@ import pytest
 
 from conftest import relmse
 from moving_camera import HEIGHT, WIDTH, true_frame
+from tungsten_dip.buffers import read_buffers
+from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
@@ -295,6 +298,22 @@ def test_a_camera_of_another_picture_is_refused(tmp_path):
         check_camera(PinholeCamera(resolution=(100, 100)), buffers)
     with pytest.raises(InputError, match="expected pinhole or thinlens"):
         check_camera(EquirectangularCamera(resolution=(WIDTH, HEIGHT)), buffers)
+
+
+def test_a_part_of_the_cameras_picture_is_refused(tmp_path):
+    camera = PinholeCamera(resolution=(WIDTH, HEIGHT))
+    channels = dict.fromkeys("RGB", np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
+    whole = ((0, 0), (WIDTH - 1, HEIGHT - 1))
+    crop = ((4, 2), (4 + WIDTH // 2 - 1, 2 + HEIGHT // 2 - 1))
+    for display, refused in ((crop, False), (whole, True)):
+        attributes = {"dataWindow": crop, "displayWindow": display}
+        write_exr(tmp_path / "a.exr", [Part(channels, attributes)])
+        buffers = read_buffers(tmp_path / "a.exr")
+        if refused:
+            with pytest.raises(InputError, match=r"got 24x16 pixels from \(4, 2\) of it; render without"):
+                check_camera(camera, buffers)
+        else:
+            check_camera(camera, buffers)
 
 
 # --- Flicker ---

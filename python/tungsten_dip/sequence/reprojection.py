@@ -35,7 +35,7 @@ _LEAST_WEIGHT = 0.25
 
 
 def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
-    """Raise InputError if frames cannot be moved with this camera, or it took another picture."""
+    """Raise InputError if frames cannot be moved with this camera, or it took another or a larger picture."""
     if not isinstance(camera, PerspectiveCamera):
         raise InputError(
             f"camera of type {camera.kind}: expected pinhole or thinlens; leave the cameras out, frames are "
@@ -47,6 +47,15 @@ def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
             f"the camera takes {width}x{height} pixels, the buffers have {buffers.width}x{buffers.height}; "
             f"name the scene that they were rendered from"
         )
+    if buffers.source is not None:
+        part = buffers.source.parts[buffers.source.color_part]
+        data, display = (part.attributes.get(name, ()) for name in ("dataWindow", "displayWindow"))
+        if not np.array_equal(data, display):
+            column, row, width, height = part.window
+            raise InputError(
+                f"expected all that the camera takes, got {width}x{height} pixels from ({column}, {row}) of "
+                f"it; render without a crop, or leave the cameras out"
+            )
 
 
 def reproject(
