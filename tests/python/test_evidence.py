@@ -10,7 +10,8 @@ import pytest
 from conftest import MakeRender
 from tungsten_dip.buffers.model import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, _noises, unscaled
+from tungsten_dip.fit.evidence import Evidence, _noises
+from tungsten_dip.fit.exposure import unscaled
 from tungsten_dip.fit.pilots import PilotMaker
 from tungsten_dip.fit.planes import loss_weights
 

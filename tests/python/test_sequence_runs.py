@@ -119,8 +119,8 @@ def touched(path):
         lambda _: replace(RUN, settings=replace(RUN.settings, seed=1)),
         lambda _: replace(RUN, refit=2),
         lambda _: replace(RUN, mapping={"visibility": "none"}),
-        lambda _: replace(RUN, half=True),
-        lambda _: replace(RUN, warm_start="0123abcd"),
+        lambda _: replace(RUN, float16=True),
+        lambda _: replace(RUN, warm_start_sha256="0123abcd"),
     ],
 )
 def test_a_frame_is_done_again_where_anything_that_made_it_has_changed(frames, monkeypatch, changed):

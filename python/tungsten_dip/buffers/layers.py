@@ -28,6 +28,8 @@ ALIASES = {
 }
 """Layer names of every quantity in lower case, best first. The empty name is the top level."""
 
+_THREE_CHANNELS = tuple(quantity for quantity, count in CHANNELS.items() if count == 3)
+
 PLANES = {"mean": "", "half_a": "A", "half_b": "B", "variance": "Variance"}
 """The fields of a Buffer, and what Tungsten appends to a quantity's name for each."""
 
@@ -161,7 +163,7 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
                     break
                 held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
                 # One channel called color may be an id, beside the three that are the colour.
-                too_few = count < CHANNELS.get(quantity, 1)
+                too_few = quantity in _THREE_CHANNELS and count < 3
                 matches.append((strange, too_few, rank, -held, layer))
                 break
     return min(matches)[-1] if matches else None

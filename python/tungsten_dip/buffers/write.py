@@ -73,9 +73,9 @@ class Denoised(Protocol):
 def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, float16: bool = False) -> None:
     """Write the denoised picture together with the buffers it was made from (see the top of this file).
 
-    With ``float16``, the picture and the error are stored as 16 bit floats, unless their values are too large or
-    too small for that. Settings, seed, seconds, iterations, the estimated relMSE and the
-    version become attributes.
+    With ``float16``, the picture and the error are stored as 16 bit floats, unless their values are too large
+    or too small for that. Settings, seed, seconds, iterations, the estimated relMSE and the version become
+    attributes.
 
     Raises InputError if the file is no .exr or cannot be written, or the result is of another size than the
     buffers; an existing file then stays as it was.
