@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tungsten_dip.buffers import FloatImage
+from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.sequence.following import Follower
 
 
 def _halves(height: int = 24, width: int = 31) -> tuple[FloatImage, FloatImage]:
@@ -125,3 +127,32 @@ def test_one_huge_firefly_among_many_does_not_brighten_the_image() -> None:
         assert gain is not None
         gains.append(gain.mean() - 1)
     assert gains[1] < 1.1 * gains[0]
+
+
+def test_pixels_without_noise_gain_nothing() -> None:
+    rng = np.random.default_rng(2)
+    halves = _halves(120, 200)
+    halves[0][:, 100:][rng.random((120, 100)) < 0.01] = 40
+    for half in halves:
+        half[:, :100] = 1
+    gain = limit_fireflies(*halves, 2).gain
+    assert gain is not None
+    assert gain[:, :90].max() == 1
+    assert gain[:, 120:].mean() > 1.03
+
+
+def test_images_get_back_what_is_certain_and_frames_of_a_sequence_do_not() -> None:
+    rng = np.random.default_rng(3)
+    half_a, half_b = _halves(96, 128)
+    half_a[rng.random((96, 128)) < 0.01] = 40
+    buffers = RenderBuffers(Buffer((half_a + half_b) / 2, half_a, half_b))
+    settings = FitSettings(preset="draft", iterations=5)
+    image = denoise(buffers, settings)
+    assert image.halves is not None
+    assert image.gain is not None
+    assert image.gain.mean() > 1.03
+    plain = sum(image.halves) / 2
+    np.testing.assert_allclose(image.color, plain * image.gain, rtol=1e-5)
+    frame = Follower(settings).denoise(buffers).result
+    assert frame.gain is None
+    np.testing.assert_allclose(frame.color, plain, rtol=1e-5)

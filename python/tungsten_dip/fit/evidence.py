@@ -27,6 +27,7 @@ from tungsten_dip.fit.pilots import (
     Guides,
     Pilot,
     PilotMaker,
+    alpha_as_albedo,
     first_guides,
     following_guides,
     guidance_of_halves,
@@ -375,12 +376,13 @@ def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImag
 
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
-    """Return notes on missing features, if there are any."""
+    """Return a note on missing features, if there are any."""
     missing = [name for name in FEATURES if buffers.get(name) is None]
     if not missing:
         return ()
-    replaced = "; alpha takes the albedo's place" if "albedo" in missing and buffers.alpha is not None else ""
-    return (f"no {', '.join(missing)}: edges are found with less evidence{replaced}",)
+    alpha = alpha_as_albedo(buffers)
+    instead = "" if alpha is None or np.ptp(alpha) == 0 else "; alpha takes the albedo's place"
+    return (f"no {', '.join(missing)}: edges are found with less evidence{instead}",)
 
 
 def denominators_of(smooth: Halves) -> Halves:

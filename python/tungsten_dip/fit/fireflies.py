@@ -1,6 +1,7 @@
 """Fireflies: single samples so bright that no filter can spread them without leaving a blot.
 
-Their radiance is limited. What this removes is given back evenly, as far as it is statistically certain.
+Their radiance is limited. As far as what this removes is statistically certain, it is given back, spread over
+noisy surroundings.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.neighbours import mean_around
 
@@ -36,6 +38,9 @@ _MOST_RETURNED = 60.0
 _SURELY = 3.0
 """So many standard errors are subtracted from what is given back."""
 
+_LEAST = 1e-15
+"""Divisors are no less, in radiance."""
+
 
 @dataclass(frozen=True)
 class Limited:
@@ -59,16 +64,16 @@ def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> Lim
     levels = [_level(half) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)
     limits = [np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other) for other in levels[::-1]]
-    taken = [np.maximum(level - limit, 0) for level, limit in zip(levels, limits, strict=True)]
-    count = sum(int(np.count_nonzero(t)) for t in taken)
+    count = sum(int(np.count_nonzero(level > limit)) for level, limit in zip(levels, limits, strict=True))
     if count == 0:
         return Limited((half_a, half_b))
     a, b = (_limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True))
+    taken = [np.maximum(level - limit, 0) for level, limit in zip(levels, limits, strict=True)]
     share = float(taken[0].sum() + taken[1].sum()) / float(levels[0].sum() + levels[1].sum())
     noun = "firefly" if count == 1 else "fireflies"
     note = f"{count} {noun} limited, with {100 * share:.3g}% of the image's energy"
-    kept = (levels[0] - taken[0] + levels[1] - taken[1]) / 2
-    return Limited((a, b), _gain(taken, kept, around, threads), note)
+    returned = [np.minimum(t, _MOST_RETURNED * around).astype(np.float32) for t in taken]
+    return Limited((a, b), _gain(returned, (a, b), threads), note)
 
 
 _Levels = npt.NDArray[np.float64]
@@ -87,26 +92,30 @@ def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> FloatImage:
     return limited
 
 
-def _gain(taken: list[_Levels], kept: _Levels, around: FloatImage, threads: int) -> FloatImage:
-    """Return 1 plus the certain part of what was ``taken`` from the halves, relative to what was ``kept``.
+def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
+    """Return 1 plus the certain part of what was ``taken`` from the halves, relative to their level.
 
-    Both are means over a window of half the image's longer side. Fireflies strike independently of one
+    It is the mean over a window of half the image's longer side, less three standard errors, and goes where
+    the halves differ: pixels without noise keep their radiance. Fireflies strike independently of one
     another, so that the variance of their sum is the sum of their squares.
     """
-    height, width = kept.shape[:2]
+    height, width = taken[0].shape[:2]
     radius = max(height, width) // 4
-    unit = float(around.max()) or 1.0
-    parts = [np.minimum(t, _MOST_RETURNED * around) / unit for t in taken]
-
-    def mean(values: _Levels) -> _Levels:
-        return np.maximum(_core.box_mean(values.astype(np.float32), radius, threads), 0).astype(np.float64)
-
-    pixels = _extents(height, radius)[:, None, None] * _extents(width, radius)[:, None]
-    returned = mean((parts[0] + parts[1]) / 2)
-    error = np.sqrt(mean((parts[0] ** 2 + parts[1] ** 2) / 4) / pixels)
-    certain = np.maximum(returned - _SURELY * error, 0)
-    gain: FloatImage = (1 + certain / np.maximum(mean(kept / unit), 1e-30)).astype(np.float32)
+    pixels = np.outer(_extents(height, radius), _extents(width, radius))[:, :, None]
+    mean = _mean(np.float32(0.5) * (taken[0] + taken[1]), radius, threads)
+    squares = _mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
+    certain = np.maximum(mean - np.float32(_SURELY) * np.sqrt(squares / pixels), 0)
+    a, b = (channel_mean(half) for half in halves)
+    level = _mean(np.float32(0.5) * (a + b), _RADIUS, threads)
+    noise = _mean(np.abs(a - b), _RADIUS, threads)
+    share = noise / np.maximum(_mean(noise, radius, threads), np.float32(_LEAST))
+    gain: FloatImage = (1 + certain * share / np.maximum(level, np.float32(_LEAST))).astype(np.float32)
     return gain
+
+
+def _mean(values: FloatImage, radius: int, threads: int) -> FloatImage:
+    # The sums behind it cancel to below 0.
+    return np.maximum(_core.box_mean(values, radius, threads), 0)
 
 
 def _extents(size: int, radius: int) -> npt.NDArray[np.int64]:

@@ -188,6 +188,7 @@ def result_from_fused(
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),
         halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
+        gain=evidence.gain,
         history=tuple(history),
         notes=tuple(notes),
     )

@@ -48,7 +48,7 @@ _LEAST_GUIDE_VARIANCE = 1e-5
 _ACROSS_EDGES = 0.3
 """Standard deviation, in pixels, of the mean along edges in the direction across them."""
 
-_CHANNELS = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
+_CHANNELS = {"albedo": "RGB", "alpha": "A", "normal": "XYZ", "depth": "Z"}
 
 _STRAY = 4.0
 _STRAY_RADIUS = 2
@@ -170,12 +170,13 @@ def guidance_of_halves(
     ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
     shape (height, width, 3). The guidance of a half is computed from its own samples alone (the other half
     only determines which of them are averaged), since errors that a half's features share with the colour
-    that scores them would be mistaken for signal.
+    that scores them would be mistaken for signal. Features without halves, and alpha, which has none, are the
+    exception.
     """
     count = len(colors)
-    if buffers.albedo is None and buffers.alpha is not None:
-        # Premultiplied colour is a surface's times its coverage, as it is its irradiance times its albedo.
-        buffers = replace(buffers, albedo=_albedo_from_alpha(buffers.alpha))
+    alpha = alpha_as_albedo(buffers)
+    if alpha is not None:
+        buffers = replace(buffers, albedo=Buffer(np.repeat(alpha, 3, axis=2)))
     albedos: tuple[FloatImage, ...] = ()
     if buffers.albedo is not None:
         rendered = _without_stray_emission(buffers.albedo, threads)
@@ -183,7 +184,10 @@ def guidance_of_halves(
         buffers = replace(buffers, albedo=_with_planes(rendered, albedos))
     filtered = prefilter_features(buffers, threads)
     depth_scale = _depth_scale(filtered)
-    planes_of_colors = [_feature_planes(filtered, index, count, depth_scale) for index in range(count)]
+    planes_of_colors = [
+        _feature_planes(filtered, index, count, depth_scale, of_alpha=alpha is not None)
+        for index in range(count)
+    ]
     flat = [
         name
         for name in planes_of_colors[0]
@@ -198,9 +202,15 @@ def guidance_of_halves(
     )
 
 
-def _albedo_from_alpha(alpha: FloatImage) -> Buffer:
-    covered = np.clip(np.nan_to_num(alpha), 0, 1)
-    return Buffer(np.repeat(covered, 3, axis=2))
+def alpha_as_albedo(buffers: RenderBuffers) -> FloatImage | None:
+    """Return the alpha, 0 to 1, that takes the place of a missing albedo, shape (height, width, 1).
+
+    Premultiplied colour is that of surfaces times their coverage, as it is their irradiance times albedo.
+    """
+    if buffers.albedo is not None or buffers.alpha is None:
+        return None
+    alpha: FloatImage = np.clip(np.nan_to_num(buffers.alpha), 0, 1)
+    return alpha
 
 
 def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: float) -> tuple[FloatImage, ...]:
@@ -290,15 +300,22 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
 
 
 def _feature_planes(
-    filtered: RenderBuffers, index: int, count: int, depth_scale: float
+    filtered: RenderBuffers, index: int, count: int, depth_scale: float, of_alpha: bool
 ) -> dict[str, tuple[FloatImage, float]]:
-    """Return every channel of the features of one of ``count`` colours, scaled, and its penalty."""
+    """Return every channel of the features of one of ``count`` colours, scaled, and its penalty.
+
+    ``of_alpha``: the albedo is alpha, three times.
+    """
     scaled: list[tuple[str, FloatImage, float]] = []
     if filtered.albedo is not None:
         albedo = _planes(filtered.albedo, count)[index]
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
-        scaled.append(("albedo", np.clip(albedo, 0, 1) + brightness, _ALBEDO_PENALTY))
+        surfaces = np.clip(albedo, 0, 1) + brightness
+        if of_alpha:
+            scaled.append(("alpha", surfaces[:, :, :1], 3 * _ALBEDO_PENALTY))
+        else:
+            scaled.append(("albedo", surfaces, _ALBEDO_PENALTY))
     if filtered.normal is not None:
         normal = np.clip(_planes(filtered.normal, count)[index], -1, 1)
         scaled.append(("normal", normal, _NORMAL_PENALTY))

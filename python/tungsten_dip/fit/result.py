@@ -27,6 +27,9 @@ class FitResult:
     (height, width, 1), the mean over 9x9 pixels. ``halves`` are the results of half A of the samples alone
     and of half B alone, in the units and shape of ``color``, which is their mean with the preset draft, and
     with the others moved from it towards the pilots of all samples. These are None with the preset paper.
+    ``gain``, shape (height, width, 1), is what ``color`` was multiplied by at last to give back some of the
+    radiance of fireflies (`fit.fireflies`); None without fireflies. The errors do not include what is lost of
+    it.
     ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it
     (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
     ``interrupted`` indicates that Ctrl-C ended the fit early. ``notes`` are one line each, for example on
@@ -40,6 +43,7 @@ class FitResult:
     error: FloatImage | None = None
     estimated_relmse: float | None = None
     halves: Halves | None = None
+    gain: FloatImage | None = None
     halves_drawn: bool = False
     model: Model | None = None
     history: tuple[HistoryPoint, ...] = ()

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
-from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import noise_in
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.exposure import exposure, scaled
@@ -110,19 +110,19 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     level = around.astype(np.float64) ** 2
     # The edges of a lamp in plain view are mistaken for noise, but no half may be without it.
     light = channel_mean(emitted)
-    lit = (light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads))
+    lit = ((light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads)))[:, :, 0]
 
-    def beta(level: _Plane, noise: _Plane) -> _Plane:
-        shape = np.clip(level / np.maximum(noise, 1e-30), _LEAST_SHAPE, _LARGEST_SHAPE)
-        shape = np.where(lit, np.maximum(shape, _LEAST_SHAPE_OF_LAMPS), shape)
-        return drawn.beta(shape / 2, shape / 2)
+    def beta(level: _Plane, noise: _Plane, least: FloatArray | float) -> FloatArray:
+        shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
+        values: FloatArray = drawn.beta(shape / 2, shape / 2).astype(np.float32)
+        return values
 
-    common = beta(level.sum(axis=2, keepdims=True), noise.sum(axis=2, keepdims=True))
-    single = beta(level, noise)
-    correlated = drawn.random(lit.shape) < _correlation(image, around, threads)
-    share = np.where(correlated | lit, common, single)
-    share_of_a: FloatImage = share.astype(np.float32)
-    return share_of_a
+    share = np.repeat(
+        beta(level.sum(axis=2), noise.sum(axis=2), _LEAST_SHAPE_OF_LAMPS * lit)[:, :, None], 3, 2
+    )
+    apart = (drawn.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]) & ~lit
+    share[apart] = beta(level[apart], noise[apart], 0)
+    return share
 
 
 def _correlation(image: FloatImage, around: FloatImage, threads: int) -> FloatImage:

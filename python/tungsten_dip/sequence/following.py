@@ -118,6 +118,9 @@ class Follower:
             followed = Followed(fit_fusion(buffers, self._settings, progress), how)
             self.models = replace(self.models, first=followed.result.model)
         result = followed.result
+        if result.gain is not None:
+            # It is estimated from the fireflies of one frame, and would flicker.
+            result = replace(result, color=result.color / result.gain, gain=None)
         self._error = _typical_error(result)
         self._last = _Last(buffers, smooth, camera, result)
         return replace(followed, result=completed(result, known))
