@@ -419,6 +419,39 @@ def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest
         read_buffers(tmp_path, {"color": "missing.exr"})
 
 
+@pytest.mark.parametrize("name", ["noisy", "Noisy Image", "color", "albedo"])
+def test_the_other_parts_of_a_folders_files_are_not_taken_for_its_quantities(
+    tmp_path: Path, name: str
+) -> None:
+    color, other = ({c: pixels(seed + i) for i, c in enumerate("RGB")} for seed in (0, 3))
+    albedo = save(tmp_path / "albedo.exr", *"RGB", *rgb("Denoising Albedo"))
+    save_parts(tmp_path / "color.exr", **{"rgba": color, name: other})
+    buffers = read_buffers(tmp_path)
+    assert holds(buffers.color, color, *"RGB")
+    assert holds(buffers.albedo, albedo, *"RGB")
+
+
+def test_the_colour_of_a_folder_may_be_a_layer_of_its_file(tmp_path: Path) -> None:
+    channels = save(tmp_path / "color.exr", "id", *rgb("ViewLayer.Combined"), *rgb("ViewLayer.DiffCol"))
+    buffers = read_buffers(tmp_path)
+    assert holds(buffers.color, channels, *rgb("ViewLayer.Combined"))
+    assert holds(buffers.albedo, channels, *rgb("ViewLayer.DiffCol"))
+
+
+def test_the_map_excludes_the_parts_of_a_folders_files(tmp_path: Path) -> None:
+    normal = {name: pixels(index) for index, name in enumerate("XYZ")}
+    save(tmp_path / "color.exr", *"RGB")
+    save_parts(
+        tmp_path / "normal.exr",
+        N=normal,
+        albedo={name: pixels(index) for index, name in enumerate("RGB")},
+        depth={"Z": pixels(9)},
+    )
+    buffers = read_buffers(tmp_path, {"albedo": "none", "depth": "none"})
+    assert [name for name, _ in buffers.quantities()] == ["color", "normal"]
+    assert holds(buffers.normal, normal, *"XYZ")
+
+
 def test_a_scene_names_its_buffers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "out").mkdir()
     for name in ("c", "cA", "cB", "cVariance", "n", "nVariance"):

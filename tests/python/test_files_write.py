@@ -315,6 +315,22 @@ def test_a_folder_travels_in_half(tmp_path: Path) -> None:
     assert_same(buffers, read_buffers(tmp_path / "out.exr"))
 
 
+def test_a_denoised_folder_whose_feature_another_tool_has_removed_is_read_without_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for key, seed in (("color", 0), ("albedo", 1)):
+        save(tmp_path / f"{key}.exr", {"": {channel: noise((2, 3), seed) for channel in "RGB"}})
+    buffers = read_buffers(tmp_path)
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, channels, header)] = load(tmp_path / "out.exr")
+    kept = {name: channel for name, channel in channels.items() if not name.startswith("albedo")}
+    write_exr(tmp_path / "kept.exr", [Part(kept, header)])
+    again = read_buffers(tmp_path / "kept.exr")
+    assert same_bits(again.color.mean, buffers.color.mean)
+    assert again.albedo is None
+    assert "no longer" not in caplog.text
+
+
 def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -326,6 +342,7 @@ def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
         "rgba": color,
         "crypto01": layer("", 20),
         "light": layer("light.", 30),
+        "noisy": layer("", 60),
         "far": {name: noise((4, 4)) for name in "RGB"},
     }
     window = {"displayWindow": ((0, 0), (9, 9))}  # those of the parts must agree
@@ -334,6 +351,7 @@ def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
     with caplog.at_level(logging.INFO):
         buffers = read_buffers(tmp_path)
     assert "ignored: color.exr: far, of another size" in caplog.text
+    assert same_bits(buffers.color.mean, np.stack([color[name] for name in "RGB"], axis=-1))
     assert same_bits(buffers.albedo.mean, np.stack(list(layer("", 40).values()), axis=-1))
     write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
     [(_, written, header)] = load(tmp_path / "out.exr")
@@ -344,6 +362,7 @@ def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
         **layer("crypto00.", 3),
         **layer("crypto01.", 20),
         **layer("light.", 30),
+        **layer("color.noisy.", 60),
         **layer("albedo.", 40),
         **layer("albedo.crypto00.", 50),
     }

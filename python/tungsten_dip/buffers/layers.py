@@ -116,6 +116,15 @@ def names_quantity(layer: str) -> bool:
     return matches or layer.lower().startswith((*CHANNELS, "variance"))
 
 
+def mapped_channels(value: str, channel_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the channels that a value of --map names, none if they are not there or of no known order."""
+    names = list(channel_names)
+    try:
+        return _mapped("", value, names, _layers(names))
+    except InputError:
+        return ()
+
+
 def _layers(names: list[str]) -> Layers:
     """Group channels: layer -> component in upper case -> channel."""
     layers: Layers = {}

@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
-from tungsten_dip.buffers.layers import MAP_KEYS, NOTHING, PLANES, Found, find_layers, names_quantity
+from tungsten_dip.buffers.layers import (
+    MAP_KEYS,
+    NOTHING,
+    PLANES,
+    Found,
+    find_layers,
+    mapped_channels,
+    names_quantity,
+)
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
@@ -46,11 +54,12 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     path = Path(path)
     mapping = dict(mapping or {})
     if path.is_dir():
-        return _from_images(path, *_files_of_folder(path, mapping))
+        excluded = {key: value for key, value in mapping.items() if value == NOTHING}
+        return _from_images(path, *_files_of_folder(path, mapping), excluded)
     if path.suffix.lower() == ".json":
         if mapping:
             raise InputError(f"{path}: a scene names its buffers itself; use --map with a folder or an image")
-        return _from_images(path, *_files_of_scene(path))
+        return _from_images(path, *_files_of_scene(path), {})
     source, attributes = _unwrapped(path, read_parts(path))
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
 
@@ -171,8 +180,13 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
     return files, ignored
 
 
-def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) -> RenderBuffers:
-    """Read one file per plane; each becomes a layer named as Tungsten names its file."""
+def _from_images(
+    path: Path, files: Mapping[str, Path], ignored: Sequence[str], excluded: Mapping[str, str]
+) -> RenderBuffers:
+    """Read one file per plane; each becomes a layer named as Tungsten names its file.
+
+    ``excluded`` maps what is not read to ``none``.
+    """
     images = {key: read_parts(file) for key, file in files.items()}
     color = images["color"][0]
     channels: dict[str, Channel] = {}
@@ -190,7 +204,14 @@ def _from_images(path: Path, files: Mapping[str, Path], ignored: Sequence[str]) 
     if ignored:
         _LOG.info("ignored: %s", ", ".join(ignored))
     attributes = {key: value for part in reversed(images["color"]) for key, value in part.attributes.items()}
-    return _from_source(path, Source((Part(channels, attributes),)), attributes)
+    # The name of a file says what it holds, whatever the names of its other layers and parts.
+    named = {}
+    for key, count in CHANNELS.items():
+        top_level = mapped_channels(key, channels) if key in files else ()
+        # Any other single channel of what has three may be an id.
+        if len(top_level) >= count or top_level == (f"{key}.Y",):
+            named[str(key)] = str(key)
+    return _from_source(path, Source((Part(channels, attributes),), {**excluded, **named}), attributes)
 
 
 def _channels_of_file(key: str, parts: Sequence[Part]) -> dict[str, Channel]:
@@ -229,11 +250,14 @@ def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, A
     restored = Part(
         channels, {key: value for key, value in attributes.items() if not key.startswith(OWN)}, first.name
     )
-    source = Source(tuple(part for part in (restored, *others) if part.channels), mapping)
+    kept = tuple(part for part in (restored, *others) if part.channels)
+    # Other tools take channels out, and leave the attributes as they are.
+    names = _full_names(kept)
+    mapping = {key: value if mapped_channels(value, names) else NOTHING for key, value in mapping.items()}
+    source = Source(kept, mapping)
     try:
         _find_layers(source)
     except InputError:
-        # Other tools take channels out, and leave the attributes as they are.
         _LOG.warning("%s: holds the noisy colour no longer: the denoised one is taken for it", path)
         return Source((replace(restored, channels=first.channels), *others)), restored.attributes
     return source, attributes
