@@ -290,6 +290,17 @@ def test_features_are_those_of_the_view_layer_that_the_map_names(tmp_path: Path)
         assert buffers.normal is None
 
 
+def test_a_colour_whose_prefix_is_no_view_layer_has_the_features_of_any(tmp_path: Path) -> None:
+    channels = save(tmp_path / "a.exr", *rgb("beauty.rgb"), *rgb("aov.albedo"), *xyz("aov.normal"))
+    buffers = read_buffers(tmp_path / "a.exr", {"color": "beauty.rgb"})
+    assert holds(buffers.color, channels, *rgb("beauty.rgb"))
+    assert holds(buffers.albedo, channels, *rgb("aov.albedo"))
+    assert holds(buffers.normal, channels, *xyz("aov.normal"))
+    albedo = {name: pixels(index) for index, name in enumerate("RGB")}
+    save_parts(tmp_path / "b.exr", **{"main.rgb": {n: pixels(9) for n in "RGB"}, "aov.albedo": albedo})
+    assert holds(read_buffers(tmp_path / "b.exr").albedo, albedo, *"RGB")
+
+
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [

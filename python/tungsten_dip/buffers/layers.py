@@ -85,7 +85,7 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
                 continue
             channels[quantity] = _ordered(layers[layer])
         if quantity == "color":
-            color_prefix = _view_layer(channels["color"][0])
+            color_prefix = _view_layer(channels["color"][0], layers)
         _add_planes(channels, quantity, layer, names, layers, mapping)
     if {"Y", "RY", "BY"} <= {name.upper() for name in channels.get("color", ())} | layers.keys():
         raise InputError(
@@ -145,10 +145,15 @@ def _layers(names: list[str]) -> Layers:
 _COMPOSITE = "composite."
 
 
-def _view_layer(channel: str) -> str:
-    """Return what precedes the layer in the name of a channel, in lower case, with its dot."""
+def _view_layer(channel: str, layers: Layers) -> str:
+    """Return what precedes the layer in the name of a channel, in lower case, with its dot.
+
+    It is empty if that is no view layer: if it precedes no layer that is named for a quantity.
+    """
     view_layer, dot, _ = channel.lower().rpartition(".")[0].rpartition(".")
-    return view_layer + dot
+    prefix = view_layer + dot
+    named = {prefix + alias for aliases in ALIASES.values() for alias in aliases if alias}
+    return "" if named.isdisjoint(layer.lower() for layer in layers) else prefix
 
 
 def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
