@@ -316,6 +316,16 @@ def test_a_part_of_the_cameras_picture_is_refused(tmp_path):
             check_camera(camera, buffers)
 
 
+def test_a_whole_picture_of_which_a_part_is_displayed_is_not_refused(tmp_path):
+    channels = dict.fromkeys("RGB", np.ones((HEIGHT, WIDTH), np.float32))
+    overscan = {
+        "dataWindow": ((-5, -5), (WIDTH - 6, HEIGHT - 6)),
+        "displayWindow": ((0, 0), (WIDTH - 11, HEIGHT - 11)),
+    }
+    write_exr(tmp_path / "a.exr", [Part(channels, overscan)])
+    check_camera(PinholeCamera(resolution=(WIDTH, HEIGHT)), read_buffers(tmp_path / "a.exr"))
+
+
 # --- Flicker ---
 
 

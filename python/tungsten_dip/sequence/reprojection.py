@@ -47,7 +47,8 @@ def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
             f"the camera takes {width}x{height} pixels, the buffers have {buffers.width}x{buffers.height}; "
             f"name the scene that they were rendered from"
         )
-    if buffers.source is not None:
+    # A picture of the camera's size is whole, also if only a part of it is to be displayed.
+    if buffers.source is not None and (buffers.width, buffers.height) != (width, height):
         part = buffers.source.parts[buffers.source.color_part]
         data, display = (part.attributes.get(name, ()) for name in ("dataWindow", "displayWindow"))
         if not np.array_equal(data, display):
