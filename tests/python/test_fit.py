@@ -824,6 +824,22 @@ def test_the_albedo_of_a_picture_full_of_light_is_used(
     assert not caplog.text
 
 
+@pytest.mark.parametrize(
+    ("radiance", "albedo"),
+    [
+        pytest.param(0.45 * 5, 5.0, id="a lamp behind fog"),
+        pytest.param(0.3, 1.2, id="an albedo of one noisy pixel"),
+        pytest.param(np.nan, 5.0, id="a colour of NaN"),
+    ],
+)
+def test_an_albedo_that_may_be_in_its_scale_is_used(
+    radiance: float, albedo: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    color, feature = (Buffer(np.full((1, 1, 3), value, np.float32)) for value in (radiance, albedo))
+    assert prepared(RenderBuffers(color, feature)).buffers.albedo is not None
+    assert "albedo" not in caplog.text
+
+
 def test_small_images_are_no_worse_for_more_pilots(make_render: MakeRender) -> None:
     errors = []
     for preset in ("draft", "balanced"):

@@ -17,8 +17,11 @@ from tungsten_dip.fit.result import FitResult
 
 _LOG = logging.getLogger(__name__)
 
-_LARGEST_ALBEDO = 1.1
-"""Of a surface: 1, and what noise and the lobes of a pixel filter add."""
+_LARGEST_ALBEDO = 2.0
+"""Of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far above."""
+
+_SEEN_LIGHT = np.float32(1 / 3)
+"""Part of a lamp's radiance that the colour contains at least; fog or a lens that darkens takes the rest."""
 
 _UNSEEN_SHARE = 0.5
 """Part of an albedo that may be above that without such light. In renders, mirrors make it 0.03 at most."""
@@ -63,15 +66,16 @@ def prepared(
 
 
 def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
-    """Return buffers without an albedo that is mostly above 1 where the colour shows no such light.
+    """Return buffers without an albedo that is mostly above 2 where the colour shows no such light.
 
     Above 1 it would be taken for emission. Of a lamp or an environment it is the radiance, which the colour
     contains; of surfaces in percent, or in 8 bits, it is not.
     """
-    if buffers.albedo is None:
+    color = buffers.color.mean
+    if buffers.albedo is None or not color.any():  # a black colour says nothing about the albedo
         return buffers
     albedo = buffers.albedo.mean
-    unseen = (albedo > _LARGEST_ALBEDO) & (buffers.color.mean < np.float32(0.5) * albedo)
+    unseen = (albedo > _LARGEST_ALBEDO) & (color < _SEEN_LIGHT * albedo)
     if np.count_nonzero(unseen) <= _UNSEEN_SHARE * np.count_nonzero(albedo):
         return buffers
     _LOG.warning(
