@@ -261,6 +261,21 @@ def test_images_replaced_after_reading_are_those_written(tmp_path: Path, changed
     assert replace(buffers, attributes={"owner": "somebody"}).source is buffers.source
 
 
+@pytest.mark.parametrize("stored", ["a layer", "an attribute", "nowhere"])
+@pytest.mark.parametrize("now", ["varies", 32.0])
+def test_samples_replaced_after_reading_are_those_written(tmp_path: Path, stored: str, now: object) -> None:
+    names = [*"RGB", "Variance.R", "Variance.G", "Variance.B", *(["spp.Y"] if stored == "a layer" else [])]
+    header = {"samplesPerPixel": 16} if stored == "an attribute" else {}
+    channels = {name: noise((3, 2), index) for index, name in enumerate(names)}
+    save(tmp_path / "in.exr", {"": channels}, **header)
+    buffers = read_buffers(tmp_path / "in.exr")
+    changed = replace(buffers, spp=noise((3, 2, 1), 9) if now == "varies" else now)
+    write_denoised(tmp_path / "out.exr", result_for(changed), changed)
+    assert_same(changed, read_buffers(tmp_path / "out.exr"))
+    if isinstance(buffers.spp, float):
+        assert replace(buffers, spp=float(buffers.spp)).source is buffers.source
+
+
 def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) -> None:
     for name, size in (("in", (3, 2)), ("other", (3, 3))):
         save(tmp_path / f"{name}.exr", {"": {channel: noise(size) for channel in "RGB"}})

@@ -111,9 +111,9 @@ class RenderBuffers:
             if isinstance(more, np.ndarray):
                 _check(name, more, (*expected, 1))
         if self.source and any(
-            getattr(self, name) is not self.source.read.get(name) for name in (*CHANNELS, "alpha")
+            _differs(getattr(self, name), self.source.read.get(name)) for name in (*CHANNELS, "alpha", "spp")
         ):
-            # `dataclasses.replace` changed an image, and took along the file that does not hold it.
+            # `dataclasses.replace` changed this, and took along the file that does not hold it.
             object.__setattr__(self, "source", None)
 
     @property
@@ -139,8 +139,18 @@ class RenderBuffers:
                 yield quantity, buffer
 
     def with_quantities(self, **buffers: Buffer | None) -> RenderBuffers:
-        """Return a copy with some quantities replaced, and without ``source``, which does not hold them."""
+        """Return a copy with some quantities replaced, and without ``source``.
+
+        What is kept for longer, such as the previous frame, does not keep all layers of its file in memory.
+        """
         return replace(self, source=None, **buffers)  # type: ignore[arg-type]
+
+
+def _differs(now: object, read: object) -> bool:
+    """Whether this is another image, or another number."""
+    if isinstance(now, (int, float)) and isinstance(read, (int, float)):
+        return now != read
+    return now is not read
 
 
 def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:

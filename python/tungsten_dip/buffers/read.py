@@ -297,7 +297,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     spp = float(spp) if isinstance(spp, (int, float)) and spp > 0 else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
-    buffers: dict[str, Any] = {}
+    buffers: dict[str, Any] = {"spp": planes.get("spp", spp)}
     _LOG.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
     for quantity in CHANNELS:
         known = {field: quantity + suffix for field, suffix in PLANES.items() if quantity + suffix in planes}
@@ -312,7 +312,6 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         _LOG.info("ignored: %s", ", ".join(found.ignored))
     return RenderBuffers(
         **buffers,
-        spp=planes.get("spp", spp),
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
         source=replace(source, color_part=color_part, read=buffers),
     )

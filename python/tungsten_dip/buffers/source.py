@@ -56,10 +56,10 @@ class Part:
 class Source:
     """The parts of an input file, the --map that assigned its layers, and which part holds the colour.
 
-    ``read`` is what was made of it: the quantities and ``alpha``, by name.
+    ``read`` is what was made of it: the quantities, ``alpha`` and ``spp``, by name.
     """
 
     parts: tuple[Part, ...]
     mapping: Mapping[str, str] = field(default_factory=dict)
     color_part: int = 0
-    read: Mapping[str, Buffer | Channel] = field(default_factory=dict)
+    read: Mapping[str, Buffer | Channel | float | None] = field(default_factory=dict)
