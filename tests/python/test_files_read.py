@@ -246,7 +246,7 @@ def test_luminance_and_chroma_are_not_taken_for_a_grey_picture(tmp_path: Path) -
     assert np.ptp(read_buffers(tmp_path / "b.exr").color.mean, axis=2).max() == 0
 
 
-@pytest.mark.parametrize("name", ["color", "noisy.Y", "noisy.foo"])
+@pytest.mark.parametrize("name", ["color", "color.Y", "noisy", "noisy.foo"])
 def test_three_channels_are_the_colour_rather_than_one(tmp_path: Path, name: str) -> None:
     channels = save(tmp_path / "a.exr", *"RGB", name)
     assert holds(read_buffers(tmp_path / "a.exr").color, channels, *"RGB")

@@ -317,6 +317,18 @@ def test_a_denoised_picture_without_its_noisy_one_is_a_picture(
     assert_same(again, read_buffers(tmp_path / "rgb_denoised.exr"))
 
 
+@pytest.mark.parametrize("names", ["Y", "RGB"])
+def test_a_denoised_picture_without_its_attributes_is_read_as_the_noisy_one(
+    tmp_path: Path, names: str
+) -> None:
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})
+    buffers = read_buffers(tmp_path / "in.exr")
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(name, channels, _)] = load(tmp_path / "out.exr")
+    save(tmp_path / "bare.exr", {name: channels})
+    assert same_bits(read_buffers(tmp_path / "bare.exr").color.mean, buffers.color.mean)
+
+
 def test_a_folder_travels_in_half(tmp_path: Path) -> None:
     for key, names in (("color", "RGB"), ("colorVariance", "RGB"), ("depth", "Y")):
         save(tmp_path / f"{key}.exr", {"": dict.fromkeys(names, HALF_WITH_NAN_BITS)})

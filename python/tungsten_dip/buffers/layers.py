@@ -177,7 +177,9 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
                     break
                 held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
                 # One channel called color may be an id, beside the three that are the colour.
-                too_few = quantity in _THREE_CHANNELS and count < 3
+                # Beside a noisy grey picture, R, G, B are what was made of it.
+                noisy_grey = alias == "noisy" and "Y" in layers[layer]
+                too_few = quantity in _THREE_CHANNELS and count < 3 and not noisy_grey
                 matches.append((strange, too_few, rank, -held, layer))
                 break
     return min(matches)[-1] if matches else None
