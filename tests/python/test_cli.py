@@ -1,3 +1,4 @@
+import io
 import json
 import logging
 import os
@@ -18,9 +19,9 @@ from conftest import SCENE
 from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
 from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.source import Part
-from tungsten_dip.cli import entry, tungsten
+from tungsten_dip.cli import console, entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
-from tungsten_dip.cli.console import duration, minutes
+from tungsten_dip.cli.console import duration, minutes, progress_on_stderr
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
@@ -745,6 +746,21 @@ def test_control_characters_of_a_file_do_not_reach_the_terminal(tmp_path, capfd)
     assert r"ignored: \x1b]0;title\x07" in told
     assert r"color=\x1b]0;title\x07: expected" in told
     assert not {"\x1b", "\x07"} & set(told)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_control_characters_do_not_reach_the_terminal_by_the_progress(terminal, monkeypatch):
+    stderr = io.StringIO()
+    stderr.isatty = lambda: terminal
+    monkeypatch.setattr(sys, "stderr", stderr)
+    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
+    with progress_on_stderr("rendering \x1b]0;a\x07") as progress:
+        progress(0.5, "frame \x9b31m")
+    told = stderr.getvalue()
+    assert r"rendering \x1b]0;a\x07" in told
+    assert r"frame \x9b31m" in told
+    assert not {"\x07", "\x9b"} & set(told)
+    assert "\x1b]" not in told  # a bar moves the cursor by other sequences
 
 
 def test_results_with_a_name_that_is_no_text_are_told(folder, tmp_path):

@@ -123,12 +123,12 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
     if sys.stderr.isatty():
         with tqdm(
             total=1.0,
-            desc=what,
+            desc=printable(what),
             bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed} <{remaining}{postfix}",
         ) as bar:
 
             def draw(fraction: float, message: str) -> None:
-                bar.set_postfix_str(message, refresh=False)
+                bar.set_postfix_str(printable(message), refresh=False)
                 bar.update(max(0.0, min(fraction, 1.0) - bar.n))
 
             yield draw
