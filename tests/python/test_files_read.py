@@ -698,6 +698,7 @@ def save_radiance(path: Path, header: str) -> None:
         ("EXPOSURE=          4.0\n", (0.25, 0.125, 0.0625)),
         ("EXPOSURE=4\nSOFTWARE=a\nEXPOSURE=.5\n", (0.5, 0.25, 0.125)),
         ("COLORCORR= 2 1 0.5\nEXPOSURE=2\n", (0.25, 0.25, 0.25)),
+        ("EXPOSURE = 2\n", (0.5, 0.25, 0.125)),
     ],
 )
 def test_radiance_pictures_are_read_in_their_own_unit(
@@ -709,10 +710,20 @@ def test_radiance_pictures_are_read_in_their_own_unit(
     assert np.array_equal(image, np.broadcast_to(np.array(expected, np.float32), (2, 3, 3)))
 
 
-@pytest.mark.parametrize("line", ["EXPOSURE=0", "EXPOSURE=-1", "EXPOSURE=inf", "EXPOSURE=x", "COLORCORR=1 2"])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "line",
+    [
+        *[
+            f"EXPOSURE={value}"
+            for value in ("0", "-1", "inf", "nan", "x", "", "1 2", "1 1 1", "1e40", "1e-50")
+        ],
+        *[f"COLORCORR={value}" for value in ("1 2", "1", "1 1 0")],
+    ],
+)
 def test_radiance_pictures_without_a_unit_are_refused(tmp_path: Path, line: str) -> None:
     save_radiance(tmp_path / "a.hdr", f"{line}\n")
-    refused(tmp_path / "a.hdr", "EXPOSURE and COLORCORR above 0|damaged")
+    refused(tmp_path / "a.hdr", f"expected one number after EXPOSURE=, three after .*, got '{line}'; save it")
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".pfm"])

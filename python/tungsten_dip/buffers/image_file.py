@@ -36,6 +36,9 @@ MAX_PIXELS = 2**28
 _MOST_BYTES = 16 << 30
 """The most that all parts of a file may hold: zeros take a thousandth of it on disk."""
 
+_RADIANCE_SCALES = {b"EXPOSURE": 1, b"COLORCORR": 3}
+"""Lines of a .hdr header that say what the pixels have been multiplied by, and how many numbers each has."""
+
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
 # What the encoder decides anew, or what describes the encoding alone. An ACES container is uncompressed and
@@ -276,17 +279,28 @@ def _radiance_scale(path: Path) -> FloatArray:
     The product of all EXPOSURE and COLORCORR lines of the header (Ward, "Radiance File Formats"), which
     OpenImageIO leaves to the reader.
     """
-    scale = np.ones(3, np.float32)
+    scale = [1.0, 1.0, 1.0]
+    smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
     with path.open("rb") as file:
         for line in file:
-            name, _, values = line.partition(b"=")
+            name, _, text = line.partition(b"=")
             if not name.strip():  # the end of the header
                 break
-            if name in (b"EXPOSURE", b"COLORCORR"):
-                scale *= np.array(values.split(), np.float32)
-    if not (np.isfinite(scale) & (scale > 0)).all():
-        raise InputError(f"{path}: expected EXPOSURE and COLORCORR above 0, got {scale}; save it as .exr")
-    return scale
+            count = _RADIANCE_SCALES.get(name.strip())
+            if count is None:
+                continue
+            try:
+                values = [float(value) for value in text.split()]
+            except ValueError:
+                values = []
+            if len(values) == count:
+                scale = [s * v for s, v in zip(scale, values * (3 // count), strict=True)]
+            if len(values) != count or not all(smallest < s < largest for s in scale):
+                raise InputError(
+                    f"{path}: expected one number after EXPOSURE=, three after COLORCORR=, above 0 and in "
+                    f"the range of float32, got {line.decode('latin-1').strip()!r:.60}; save it as .exr"
+                )
+    return np.array(scale, np.float32)
 
 
 def _storable(attributes: dict[str, Any]) -> dict[str, Any]:
