@@ -448,7 +448,12 @@ def test_half_never_turns_into_infinity_or_black(
     channels = load(tmp_path / "a.exr")[0][1]
     assert same_bits(channels["R"], other.color[..., 0].copy())
     assert channels["error.Y"].dtype == np.float16
-    assert "65504" in caplog.text
+    assert "the picture has values that half floats cannot hold (beyond 65504" in caplog.text
+    caplog.clear()
+    fits.error[0, 0] = 1e6
+    write_denoised(tmp_path / "a.exr", fits, buffers, float16=True)
+    assert load(tmp_path / "a.exr")[0][1]["error.Y"].dtype == np.float32
+    assert "the error has values that half floats cannot hold (beyond 65504" in caplog.text
 
 
 def test_attributes_that_exr_cannot_hold_do_not_cost_the_result(

@@ -198,7 +198,11 @@ def _stored(label: str, image: FloatImage, float16: bool) -> Channel:
     with np.errstate(over="ignore"):
         lost = np.abs(finite.astype(np.float16) - finite).sum(dtype=np.float64)
     if lost > _MOST_LOST * np.abs(finite).sum(dtype=np.float64):
-        _LOG.warning("%s is too bright or too dim for half floats (6e-8 to 65504): stored as float32", label)
+        _LOG.warning(
+            "%s has values that half floats cannot hold (beyond 65504, or mostly below 6e-8): stored as "
+            "float32",
+            label,
+        )
         return image
     return image.astype(np.float16)
 
