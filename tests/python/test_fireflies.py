@@ -141,6 +141,16 @@ def test_pixels_without_noise_gain_nothing() -> None:
     assert gain[:, 120:].mean() > 1.03
 
 
+def test_a_few_noisy_pixels_do_not_get_back_what_all_have_lost() -> None:
+    rng = np.random.default_rng(2)
+    half_a, half_b = (np.full((120, 200, 3), 0.5, np.float32) for _ in range(2))
+    half_a[50:60, 90:100] *= rng.gamma(1, 1, (10, 10, 1))
+    half_a[rng.random((120, 200)) < 0.05] = 400
+    gain = limit_fireflies(half_a, half_b, 2).gain
+    assert gain is not None
+    assert 1.2 < gain.max() <= 1.5
+
+
 def test_images_get_back_what_is_certain_and_frames_of_a_sequence_do_not() -> None:
     rng = np.random.default_rng(3)
     half_a, half_b = _halves(96, 128)

@@ -38,6 +38,9 @@ _MOST_RETURNED = 60.0
 _SURELY = 3.0
 """So many standard errors are subtracted from what is given back."""
 
+_LARGEST_GAIN = 1.5
+"""Where little else is noisy, a few pixels would get back what fireflies lost all over the image."""
+
 _LEAST = 1e-15
 """Divisors are no less, in radiance."""
 
@@ -46,8 +49,8 @@ _LEAST = 1e-15
 class Limited:
     """Both halves with their fireflies limited, linear radiance of shape (height, width, 3).
 
-    ``gain``, shape (height, width, 1), at least 1, times the denoised image gives back what is certain of the
-    radiance removed. ``note`` is a line on that radiance. Both are None without fireflies.
+    ``gain``, shape (height, width, 1), from 1 to 1.5, times the denoised image gives back what is certain of
+    the radiance removed. ``note`` is a line on that radiance. Both are None without fireflies.
     """
 
     halves: Halves
@@ -109,8 +112,9 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     level = _mean(np.float32(0.5) * (a + b), _RADIUS, threads)
     noise = _mean(np.abs(a - b), _RADIUS, threads)
     share = noise / np.maximum(_mean(noise, radius, threads), np.float32(_LEAST))
-    gain: FloatImage = (1 + certain * share / np.maximum(level, np.float32(_LEAST))).astype(np.float32)
-    return gain
+    gain = 1 + certain * share / np.maximum(level, np.float32(_LEAST))
+    bounded: FloatImage = np.minimum(gain, _LARGEST_GAIN).astype(np.float32)
+    return bounded
 
 
 def _mean(values: FloatImage, radius: int, threads: int) -> FloatImage:
