@@ -93,7 +93,11 @@ def fit_fusion(
     start = start_of_training(evidence, settings.seed, warm_start, members)
     evidence = start.evidence
     network = PointwiseNetwork(
-        start.weights, len(evidence.layout.planes), evidence.layout.choices, settings.device
+        start.weights,
+        len(evidence.layout.planes),
+        evidence.layout.choices,
+        settings.device,
+        evidence.threads,
     )
 
     def whole_pilots(given_up: Event) -> tuple[FloatImage, ...]:
@@ -163,7 +167,7 @@ def _trained(
     """
     given_up = Event()
     training: Training | None = None
-    # The network keeps one core busy; the pilots of all samples take what is left of all of them.
+    # Each network keeps one core busy; the pilots of all samples take what is left of all of them.
     with ThreadPoolExecutor(1) as beside:
         pending = beside.submit(whole_pilots, given_up)
         try:

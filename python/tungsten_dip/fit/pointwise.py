@@ -19,6 +19,7 @@ import numpy as np
 import onnx
 
 from tungsten_dip.buffers.model import FloatArray, FloatImage
+from tungsten_dip.cores import in_parallel
 from tungsten_dip.fit.evidence import Indices, Layout
 from tungsten_dip.fit.model import Weights, check_finite
 from tungsten_dip.graphs.builder import GraphBuilder
@@ -118,37 +119,39 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
     return weights
 
 
-class PointwiseNetwork:
-    """The members of a network and the states of their optimisers."""
+_Member = dict[str, FloatArray]
+"""The vectors of `training_step` that are a member's own."""
 
-    def __init__(self, weights: Weights, planes: int, choices: int, device: Device) -> None:
+
+class PointwiseNetwork:
+    """The members of a network and the states of their optimisers; each keeps one of ``threads`` busy."""
+
+    def __init__(self, weights: Weights, planes: int, choices: int, device: Device, threads: int = 1) -> None:
+        self._threads = threads
         self._shapes = weight_shapes(planes, choices)
         # The network is too small to share: threads would only wait for one another.
         self._step = session_from_proto(training_step(planes, choices), 1, device)
         self._fuse = session_from_proto(_forward(planes, choices), 1, device)
-        self._members = self._vectors(weights)
-        self._moments = [(np.zeros_like(member), np.zeros_like(member)) for member in self._members]
         self._steps_done = 0
+        self._members = self._states(weights)
 
     def step(self, batch: Examples, learning_rate: float) -> None:
         """Train every member on some pixels by one step of Adam: their weighted squared errors fall."""
         self._steps_done += 1
-        for index, (member, (mean, square)) in enumerate(zip(self._members, self._moments, strict=True)):
-            self._members[index], *moments = self._step.run(
-                ["next_weights", "next_mean", "next_square"],
-                {
-                    "inputs": batch.inputs,
-                    "pilots": batch.pilots,
-                    "target": batch.target,
-                    "weight": batch.weight,
-                    "weights": member,
-                    "mean": mean,
-                    "square": square,
-                    "learning_rate": np.array([learning_rate], np.float32),
-                    "step": np.array([self._steps_done], np.float32),
-                },
-            )
-            self._moments[index] = moments[0], moments[1]
+        feeds = {
+            "inputs": batch.inputs,
+            "pilots": batch.pilots,
+            "target": batch.target,
+            "weight": batch.weight,
+            "learning_rate": np.array([learning_rate], np.float32),
+            "step": np.array([self._steps_done], np.float32),
+        }
+
+        def stepped(member: _Member) -> _Member:
+            values = self._step.run([f"next_{name}" for name in member], {**feeds, **member})
+            return dict(zip(member, values, strict=True))
+
+        self._members = in_parallel(stepped, self._members, self._threads)
 
     def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> FloatArray:
         """Return the weighted mean of the pilots or, by the same weights, of ``images``; shape (pixels, 3).
@@ -164,7 +167,8 @@ class PointwiseNetwork:
                 "pilots": np.stack([image[part] for image in flat], 1) if flat else examples.pilots[part],
             }
             by_members = (
-                self._fuse.run(["fused"], {**feeds, "weights": member})[0] for member in self._members
+                self._fuse.run(["fused"], {**feeds, "weights": member["weights"]})[0]
+                for member in self._members
             )
             fused[part] = sum(by_members) / np.float32(len(self._members))
         check_finite(fused)
@@ -177,17 +181,24 @@ class PointwiseNetwork:
         for name, shape in self._shapes.items():
             end = first + int(np.prod(shape))
             conv_shape = (*shape, 1, 1) if len(shape) == 2 else shape
-            copies[name] = np.concatenate([member[first:end].reshape(conv_shape) for member in self._members])
+            copies[name] = np.concatenate(
+                [member["weights"][first:end].reshape(conv_shape) for member in self._members]
+            )
             first = end
         return copies
 
     def load(self, weights: Weights) -> None:
-        """Replace the weights."""
-        self._members = self._vectors(weights)
+        """Replace the weights; the optimisers start anew."""
+        self._steps_done = 0
+        self._members = self._states(weights)
 
-    def _vectors(self, weights: Weights) -> list[FloatArray]:
+    def _states(self, weights: Weights) -> list[_Member]:
         parts = [np.split(weights[name], members_of(weights)) for name in self._shapes]
-        return [np.concatenate([part.ravel() for part in member]) for member in zip(*parts, strict=True)]
+        vectors = [np.concatenate([part.ravel() for part in member]) for member in zip(*parts, strict=True)]
+        return [
+            {"weights": vector, "mean": np.zeros_like(vector), "square": np.zeros_like(vector)}
+            for vector in vectors
+        ]
 
 
 def members_of(weights: Weights) -> int:
