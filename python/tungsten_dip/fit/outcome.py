@@ -22,8 +22,9 @@ from tungsten_dip.fit.settings import FitSettings
 
 _ERROR_RADIUS = 4
 _CHUNK_PIXELS = 1 << 18
-_BIAS = 1.5
-"""What the squared bias is to the median squared difference of the pilots from the result, about."""
+_BIAS = 2.4
+"""What the squared bias is, about, to the geometric mean of the variance and the median squared difference of
+the pilots from the result."""
 
 _CONFIDENCE = 4.0
 """An estimate may lie so many standard errors above the error estimated from the halves."""
@@ -75,9 +76,11 @@ def estimate_error(
 
     ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs for one half each, shape
     (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
-    (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured; it is estimated as `_BIAS` times the
-    median squared difference of f and the pilots, which blur in different ways, or less if the noisy halves
-    imply a smaller mean error (see `_error_from_halves`).
+    (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
+    they differ from f where there is something to blur; but some are far off where the network rightly avoids
+    them, and there the halves' outputs agree. The bias is estimated as `_BIAS` times the geometric mean of the
+    variance and the median squared difference of f and the pilots, or less if the noisy halves imply a smaller
+    mean error (see `_error_from_halves`).
     """
     output = np.float32(0.5) * (fused_a + fused_b)
     epsilon = _epsilon_of_renderer(scale)
@@ -94,7 +97,9 @@ def estimate_error(
                 for a, b in computed
             ]
             variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
-            bias[part] = np.minimum(np.float32(_BIAS) * np.median(apart, axis=0), _LARGEST_ERROR)
+            apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
+        # The root of each: their product would overflow.
+        bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
     estimated, standard_error = _error_from_halves(pilots[0], fused_a, fused_b, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
