@@ -73,7 +73,7 @@ def test_steps_get_smaller_towards_the_end_of_the_time_budget(
     assert rates[-1] < 0.02 * LEARNING_RATE
 
 
-@pytest.mark.parametrize(("time_budget_s", "members"), [(None, 4), (1e6, 1)])
+@pytest.mark.parametrize(("time_budget_s", "members"), [(None, 6), (1e6, 1)])
 def test_final_has_one_member_under_a_time_budget(
     time_budget_s: float | None, members: int, make_render: MakeRender
 ) -> None:

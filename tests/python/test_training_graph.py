@@ -74,7 +74,7 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
     sizes = len(layout.planes), layout.choices
-    together = PointwiseNetwork(weights, *sizes, "cpu")
+    together = PointwiseNetwork(weights, *sizes, "cpu", threads=2)
     parts = {name: np.split(value, 3) for name, value in weights.items()}
     alone = [
         PointwiseNetwork({name: part[k] for name, part in parts.items()}, *sizes, "cpu") for k in range(3)

@@ -63,8 +63,8 @@ _PRESETS = {
     "draft": _Preset(
         DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, following=FOLLOWING_DRAFT_PILOTS, all_samples=False
     ),
-    "balanced": _Preset(BALANCED_PILOTS, 240),
-    "final": _Preset(FINAL_PILOTS, 240, members=4),
+    "balanced": _Preset(BALANCED_PILOTS, 160, members=2),
+    "final": _Preset(FINAL_PILOTS, 240, members=6),
 }
 
 

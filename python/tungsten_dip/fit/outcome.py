@@ -77,10 +77,10 @@ def estimate_error(
     ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs for one half each, shape
     (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
     (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
-    they differ from f where there is something to blur; but some are far off where the network rightly avoids
-    them, and there the halves' outputs agree. The bias is estimated as `_BIAS` times the geometric mean of the
-    variance and the median squared difference of f and the pilots, or less if the noisy halves imply a smaller
-    mean error (see `_error_from_halves`).
+    they differ from f where there is something to blur; but some are far off where the network rightly
+    avoids them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric
+    mean of the variance and the median squared difference of f and the pilots, or less if the noisy halves
+    imply a smaller mean error (see `_error_from_halves`).
     """
     output = np.float32(0.5) * (fused_a + fused_b)
     epsilon = _epsilon_of_renderer(scale)
