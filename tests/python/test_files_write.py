@@ -623,6 +623,13 @@ def test_a_file_that_another_process_takes_for_one_left_by_the_dead_is_made_agai
     assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
 
 
+def test_hidden_files_of_the_user_stay(tmp_path: Path) -> None:
+    for name in (".kitchen-20261129.exr", ".kitchen-0badcafe.exr"):
+        (tmp_path / name).write_text("of the user")
+    write_image(tmp_path / "kitchen.exr", noise((2, 3, 3)))
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_a_check_whose_file_another_process_removes_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -642,7 +649,7 @@ def test_names_may_be_as_long_as_the_file_system_lets_them(tmp_path: Path, lette
     path = tmp_path / f"{letter * (longest // len(letter.encode()))}.exr"
     check_writable(path)
     for seed in range(2):
-        (tmp_path / f".{letter * (100 // len(letter.encode()))}-01234567.exr").write_text("left by the dead")
+        (tmp_path / f".{letter * (100 // len(letter.encode()))}-01234567.tungsten-dip.exr").write_text("old")
         write_image(path, noise((2, 3, 3), seed))
         assert list(tmp_path.iterdir()) == [path]
         assert np.array_equal(read_image(path), noise((2, 3, 3), seed))

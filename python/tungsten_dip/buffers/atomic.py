@@ -69,12 +69,17 @@ def _resolved(path: Path) -> Path:
 
 
 def _temporary(target: Path) -> Path:
-    return target.with_name(f"{_prefix(target)}{secrets.token_hex(_TOKEN_BYTES)}{target.suffix}")
+    return target.with_name(f"{_prefix(target)}{secrets.token_hex(_TOKEN_BYTES)}{_end(target)}")
 
 
 def _prefix(target: Path) -> str:
     """Return what the names of temporary files begin with: the stem, cut lest they be too long."""
     return f".{os.fsencode(target.stem)[:_MOST_OF_STEM_BYTES].decode(errors='ignore')}-"
+
+
+def _end(target: Path) -> str:
+    """Return what they end with: a mark, lest a file of the user's with a date in its name pass for one."""
+    return f".tungsten-dip{target.suffix}"
 
 
 @contextmanager
@@ -97,7 +102,7 @@ def _locked_temporary(target: Path) -> Iterator[Path]:
 def _remove_left_by_the_dead(target: Path) -> None:
     """Remove temporary files of ``target`` whose writers live no more: these alone are not locked."""
     name = re.compile(
-        re.escape(_prefix(target)) + f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}" + re.escape(target.suffix)
+        re.escape(_prefix(target)) + f"[0-9a-f]{{{2 * _TOKEN_BYTES}}}" + re.escape(_end(target))
     )
     with suppress(OSError):
         for path in target.parent.iterdir():
