@@ -400,12 +400,17 @@ def test_denoised_pictures_lie_beside_the_noisy_ones(tmp_path, renders, fits, ca
 
 
 def test_pictures_of_unknown_types_are_written_as_known_ones(tmp_path, renders, caplog):
-    buffers = [{"type": "normal", "hdr_output_file": "n.tif"}]
+    buffers = [
+        {"type": "albedo", "hdr_output_file": "albedo.hdr"},
+        {"type": "normal", "hdr_output_file": "normal.hdr"},  # which knows no sign
+        {"type": "depth", "hdr_output_file": "depth.tif"},
+    ]
     scene = write_scene(
         tmp_path / "scene.json", output_file="a.jpg", hdr_output_file="b", output_buffers=buffers
     )
     assert tungsten.main(["--host", "mitsuba", str(scene)]) == 0
-    assert {"a.png", "b.exr", "n.exr"} <= {path.name for path in tmp_path.iterdir()}
+    written = {path.name for path in tmp_path.iterdir()} - {scene.name}
+    assert written == {"a.png", "b.exr", "albedo.hdr", "normal.exr", "depth.exr"}
 
 
 def test_a_picture_that_does_not_fit_into_memory_is_one_line(scene, capfd, monkeypatch):

@@ -542,6 +542,15 @@ def test_png_clips_and_rounds(tmp_path: Path) -> None:
     assert stored.ravel().tolist() == [0, 0, 0, 1, 255, 255]
 
 
+def test_negative_values_are_not_lost_in_a_format_without_sign(tmp_path: Path) -> None:
+    image = noise((3, 2, 3)) - np.float32(0.5)
+    with pytest.raises(InputError, match=r"a\.hdr: expected no negative values, .*; use \.exr or \.pfm"):
+        write_image(tmp_path / "a.hdr", image)
+    for suffix in (".exr", ".pfm"):
+        write_image(tmp_path / f"a{suffix}", image)
+        assert np.array_equal(read_image(tmp_path / f"a{suffix}"), image)
+
+
 def test_pfm_is_stored_bottom_up(tmp_path: Path) -> None:
     image = noise((3, 2, 3))
     write_image(tmp_path / "a.pfm", image)

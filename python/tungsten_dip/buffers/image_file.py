@@ -20,7 +20,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import replacing
-from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.buffers.model import FloatArray, Quantity
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -54,6 +54,11 @@ _ENCODING = {
     "type",
     "version",
 }
+
+
+def radiance_suffixes(quantity: Quantity) -> tuple[str, ...]:
+    """Return the formats that hold a quantity, in the order of preference: .hdr knows no sign."""
+    return tuple(suffix for suffix in RADIANCE_SUFFIXES if quantity != "normal" or suffix != ".hdr")
 
 
 def read_parts(path: Path) -> tuple[Part, ...]:
@@ -161,8 +166,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     """Write one picture of shape (height, width, 1 or 3), whole or not at all.
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
-    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, or the file cannot be
-    written.
+    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if a .hdr would lose
+    negative values, or if the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -179,6 +184,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         write_exr(path, [Part(channels)])
         return
     if suffix == ".hdr":
+        if (image < 0).any():
+            raise InputError(f"{path}: expected no negative values, which .hdr cannot hold; use .exr or .pfm")
         image = np.broadcast_to(image, (*image.shape[:2], 3))
     height, width, count = image.shape
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")

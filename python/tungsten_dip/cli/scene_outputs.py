@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
-from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES
+from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName
@@ -98,11 +98,14 @@ def scene_outputs(
     def placed(own: Path | None, name: str) -> Path | None:
         return own_folder / own if own else folder / name if name else None
 
+    def absolute(name: str, suffixes: tuple[str, ...]) -> str:
+        return str(folder / _known(name, suffixes)) if name else ""
+
     buffers = tuple(
         replace(
             buffer,
-            ldr_output_file=str(folder / name) if (name := _known(buffer.ldr_output_file, _LDR)) else "",
-            hdr_output_file=str(folder / name) if (name := _known(buffer.hdr_output_file, _HDR)) else "",
+            ldr_output_file=absolute(buffer.ldr_output_file, _LDR),
+            hdr_output_file=absolute(buffer.hdr_output_file, radiance_suffixes(buffer.type)),
         )
         for buffer in renderer.output_buffers
     )
