@@ -87,10 +87,7 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
         if quantity == "color":
             color_prefix = _view_layer(channels["color"][0], layers)
         _add_planes(channels, quantity, layer, names, layers, mapping)
-    if {"Y", "RY", "BY"} <= {name.upper() for name in channels.get("color", ())} | layers.keys():
-        raise InputError(
-            "the colour is luminance and chroma (Y, RY, BY): expected R, G, B; convert the image"
-        )
+    check_no_chroma(channels.get("color", ()), names)
     if "color" not in channels:
         found = _listed(layers) or "nothing"
         raise InputError(f"no colour: expected R, G, B or layer color, found {found}; use --map color=LAYER")
@@ -108,6 +105,14 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
         layer or "top level" for layer, components in layers.items() if used.isdisjoint(components.values())
     )
     return Found(channels, ignored)
+
+
+def check_no_chroma(color: Iterable[str], channel_names: Iterable[str]) -> None:
+    """Raise InputError if the channels of the colour are luminance, and others of the file its chroma."""
+    if "Y" in map(str.upper, color) and {"RY", "BY"} <= set(channel_names):
+        raise InputError(
+            "the colour is luminance and chroma (Y, RY, BY): expected R, G, B; convert the image"
+        )
 
 
 def names_quantity(layer: str) -> bool:

@@ -21,6 +21,7 @@ from tungsten_dip.buffers.layers import (
     NOTHING,
     PLANES,
     Found,
+    check_no_chroma,
     find_layers,
     mapped_channels,
     names_quantity,
@@ -83,6 +84,10 @@ def read_image(path: str | Path) -> FloatImage:
             raise InputError(
                 f"{path}: expected channels R, G, B or Y, found {found}; name another file"
             ) from error
+    try:
+        check_no_chroma(names, channels)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     image = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
     return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
 
