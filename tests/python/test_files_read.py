@@ -339,6 +339,19 @@ def test_parts_are_layers(tmp_path: Path) -> None:
     assert holds(read_buffers(tmp_path / "a.exr", {"color": "main"}).color, color, *"RGB")
 
 
+def test_a_layer_named_like_its_part_hides_no_channel(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = [*"RGB", *rgb("beauty")]
+    channels = {name: pixels(index) for index, name in enumerate(names)}
+    save_parts(tmp_path / "a.exr", beauty=channels, normal={n: pixels(9) for n in "XYZ"})
+    with caplog.at_level(logging.INFO):
+        assert holds(read_buffers(tmp_path / "a.exr").color, channels, *rgb("beauty"))
+    assert "ignored: beauty" in caplog.messages
+    mapping = {"color": "beauty"}
+    assert holds(read_buffers(tmp_path / "a.exr", mapping).color, channels, *"RGB")
+
+
 def test_tiles_and_mipmaps(tmp_path: Path) -> None:
     tiles = OpenEXR.TileDescription()
     tiles.xSize = tiles.ySize = 4

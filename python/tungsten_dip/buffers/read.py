@@ -327,8 +327,10 @@ def _full_names(parts: Sequence[Part]) -> dict[str, tuple[Part, str]]:
     names = {}
     for part in parts:
         prefix = f"{part.name}." if len(parts) > 1 else ""
+        # In a part "beauty" that holds both R and beauty.R, the latter is of a layer "beauty" within.
+        nested = any(prefix + name in part.channels for name in part.channels)
         for name in part.channels:
-            names[name if name.startswith(prefix) else prefix + name] = (part, name)
+            names[name if name.startswith(prefix) and not nested else prefix + name] = (part, name)
     return names
 
 
