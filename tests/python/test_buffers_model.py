@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import tungsten_dip as dip
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.settings import FitSettings
 
 GREY = np.full((4, 5, 3), 0.5, np.float32)
+NOISY = RenderBuffers(Buffer(GREY))
+RESULT = FitResult(GREY, FitSettings(), seconds=0, iterations=0)
 
 
 def unaligned() -> np.ndarray:
@@ -52,6 +58,41 @@ def test_arrays_of_another_kind_are_refused(half, words):
 def test_what_is_of_another_type_is_refused(call, words):
     with pytest.raises(InputError, match=f"^{words}"):
         call()
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.ma.masked_array(GREY, mask=GREY > 0), r"expected an array without a mask, .*; use \.filled\(0\)"),
+        (GREY.astype(complex), "expected real numbers, got complex128; "),
+        (GREY.astype(object), "expected real numbers, got object; "),
+        (GREY.tolist(), "expected ndarray, got list; "),
+    ],
+)
+@pytest.mark.parametrize(
+    ("what", "take"),
+    [
+        ("half_a", lambda image, _: Buffer(GREY, image, GREY)),
+        ("alpha", lambda image, _: RenderBuffers(Buffer(GREY), alpha=image)),
+        ("candidate 0, half B", lambda image, _: dip.denoise(NOISY, candidates=[(GREY, image)])),
+        ("previous, half A", lambda image, _: dip.denoise(NOISY, previous=(image, GREY))),
+        ("image", lambda image, _: dip.compare(image, GREY)),
+        ("reference", lambda image, _: dip.compare(GREY, image)),
+        ("a.png", lambda image, folder: dip.write_image(folder / "a.png", image)),
+        (
+            "result color",
+            lambda image, folder: dip.write_denoised(folder / "a.exr", replace(RESULT, color=image), NOISY),
+        ),
+        (
+            "result error",
+            lambda image, folder: dip.write_denoised(folder / "a.exr", replace(RESULT, error=image), NOISY),
+        ),
+    ],
+)
+def test_images_that_are_no_arrays_of_numbers_are_refused(what, take, image, words, tmp_path):
+    with pytest.raises(InputError, match=f"{what}: {words}"):
+        take(image, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_asked_for_helps():

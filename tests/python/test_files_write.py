@@ -282,9 +282,25 @@ def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) ->
     buffers, other = (read_buffers(tmp_path / f"{name}.exr") for name in ("in", "other"))
     with pytest.raises(InputError, match="made from"):
         write_denoised(tmp_path / "out.exr", result_for(other), buffers)
+    with pytest.raises(InputError, match="made from"):
+        write_denoised(
+            tmp_path / "out.exr", replace(result_for(buffers), error=result_for(other).error), buffers
+        )
     with pytest.raises(InputError, match=r"ends in \.exr"):
         write_denoised(tmp_path / "out.png", result_for(buffers), buffers)
     assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int32, np.uint8])
+def test_a_result_may_be_graded_in_another_type(tmp_path: Path, dtype: type) -> None:
+    buffers = RenderBuffers(Buffer(noise((3, 2, 3))))
+    result = result_for(buffers)
+    graded = replace(result, color=(5 * result.color).astype(dtype), error=result.error.astype(dtype))
+    write_denoised(tmp_path / "out.exr", graded, buffers)
+    [(_, written, _)] = load(tmp_path / "out.exr")
+    for index, name in enumerate("RGB"):
+        assert same_bits(written[name], graded.color[..., index].astype(np.float32))
+    assert same_bits(written["error.Y"], graded.error[..., 0].astype(np.float32))
 
 
 def test_the_map_is_remembered(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import replacing
-from tungsten_dip.buffers.model import FloatArray, Quantity
+from tungsten_dip.buffers.model import FloatArray, Quantity, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -166,13 +166,14 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     """Write one picture of shape (height, width, 1 or 3), whole or not at all.
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
-    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if a .hdr would lose
-    negative values, or if the file cannot be written.
+    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if these are no numbers,
+    if a .hdr would lose negative values, or if the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (*RADIANCE_SUFFIXES, ".png"):
         raise InputError(f"{path}: expected a name that ends in {', '.join(RADIANCE_SUFFIXES)} or .png")
+    check_array(str(path), image)
     if image.ndim != 3 or image.shape[2] not in (1, 3) or image.size == 0:
         raise InputError(
             f"{path}: expected a picture of shape (height, width, 1 or 3), got {image.shape}; reshape it, or "

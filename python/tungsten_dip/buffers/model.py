@@ -45,7 +45,7 @@ class Buffer:
     ``half_a`` and ``half_b`` are the means of two disjoint halves of the samples; ``variance`` is the
     variance of ``mean`` (not of one sample). All have the shape of ``mean``.
 
-    Raises InputError if one is no array.
+    Raises InputError if one is no array of numbers (`check_array`).
     """
 
     mean: FloatImage
@@ -55,7 +55,7 @@ class Buffer:
 
     def __post_init__(self) -> None:
         for name, plane in (("mean", self.mean), *self.planes()):
-            check_type(name, plane, np.ndarray, _AS_ARRAY)
+            check_array(name, plane)
 
     @property
     def halves(self) -> Halves | None:
@@ -102,7 +102,9 @@ class RenderBuffers:
         for quantity, buffer in (("color", self.color), *self.quantities()):
             check_type(quantity, buffer, Buffer, "use Buffer(array)")
         if self.alpha is not None:
-            check_type("alpha", self.alpha, np.ndarray, _AS_ARRAY)
+            check_array("alpha", self.alpha)
+        if isinstance(self.spp, np.ndarray):
+            check_array("spp", self.spp)
         expected = self.color.mean.shape[:2]
         for quantity, buffer in self.quantities():
             for plane, array in buffer.planes():
@@ -151,6 +153,15 @@ def _differs(now: object, read: object) -> bool:
     if isinstance(now, (int, float)) and isinstance(read, (int, float)):
         return now != read
     return now is not read
+
+
+def check_array(what: str, array: Any, remedy: str = _AS_ARRAY) -> None:
+    """Raise InputError if this is no array of real numbers, or one with a mask, which nothing here heeds."""
+    check_type(what, array, np.ndarray, remedy)
+    if isinstance(array, np.ma.MaskedArray):
+        raise InputError(f"{what}: expected an array without a mask, got MaskedArray; use .filled(0)")
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{what}: expected real numbers, got {array.dtype}; {remedy}")
 
 
 def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
-from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers, check_array
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
 
@@ -78,20 +78,17 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     attributes.
 
     Raises InputError if the file is no .exr or cannot be written, or the result is of another size than the
-    buffers; an existing file then stays as it was.
+    buffers or no numbers; an existing file then stays as it was.
     """
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: expected a name that ends in .exr, which holds all layers")
-    if result.color.shape != buffers.color.mean.shape:
-        raise InputError(
-            f"the result has shape {result.color.shape}, the buffers {buffers.color.mean.shape}; "
-            f"give those that it was made from"
-        )
+    color = _of_result("color", result.color, buffers, 3)
     source = buffers.source or _source_from_buffers(buffers)
-    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", result.color, float16))
+    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", color, float16))
     if result.error is not None:
-        added |= _channels("error.", "Y", _stored("the error", result.error, float16))
+        error = _of_result("error", result.error, buffers, 1)
+        added |= _channels("error.", "Y", _stored("the error", error, float16))
     single = len(source.parts) == 1
     kept = source.parts[0].channels if single else {}
     if buffers.alpha is not None and "A" not in kept:
@@ -189,6 +186,18 @@ def _frame(buffers: RenderBuffers) -> dict[str, Any]:
 
 def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
     return {prefix + name: image[..., index] for index, name in enumerate(names)}
+
+
+def _of_result(name: str, image: FloatImage, buffers: RenderBuffers, channels: int) -> FloatImage:
+    """Return an image of a result, which may have been graded in another type, as float32."""
+    check_array(f"result {name}", image)
+    expected = (buffers.height, buffers.width, channels)
+    if image.shape != expected:
+        raise InputError(
+            f"the {name} of the result has shape {image.shape}, that of the buffers {expected}; give those "
+            f"that it was made from"
+        )
+    return image.astype(np.float32, copy=False)
 
 
 def _stored(label: str, image: FloatImage, float16: bool) -> Channel:

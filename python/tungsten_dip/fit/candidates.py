@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Halves, RenderBuffers
+from tungsten_dip.buffers.model import Halves, RenderBuffers, check_array
 from tungsten_dip.errors import InputError
 
 
@@ -38,11 +38,12 @@ def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
     if len(pair) != 2:
         raise InputError(f"{what}: expected a pair of images, one per half, got {len(pair)}")
     expected = buffers.color.mean.shape
-    with np.errstate(over="ignore"):
-        images = [np.ascontiguousarray(image, np.float32) for image in pair]
-    for name, image in zip("AB", images, strict=True):
+    for name, image in zip("AB", pair, strict=True):
+        check_array(f"{what}, half {name}", image)
         if image.shape != expected:
             raise InputError(
                 f"{what}, half {name}: expected shape {expected} as the colour has it, got {image.shape}"
             )
-    return images[0], images[1]
+    with np.errstate(over="ignore"):
+        a, b = (np.ascontiguousarray(image, np.float32) for image in pair)
+    return a, b

@@ -10,9 +10,9 @@ from importlib.util import find_spec
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_radiance
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.model import FloatImage, check_array
 from tungsten_dip.buffers.relmse import relative_squared_error
-from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.errors import InputError
 from tungsten_dip.extras import requirement
 
 _LOG = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     or if the reference is not finite.
     """
     for name, given in (("image", image), ("reference", reference)):
-        check_type(name, given, np.ndarray, "read_image reads one from a file")
+        check_array(name, given, "read_image reads one from a file")
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3:
         raise InputError(
             f"compare: expected two images of one shape (height, width, 3), got {image.shape} and "
