@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -74,6 +75,7 @@ def test_what_is_of_another_type_is_refused(call, words):
     [
         ("half_a", lambda image, _: Buffer(GREY, image, GREY)),
         ("alpha", lambda image, _: RenderBuffers(Buffer(GREY), alpha=image)),
+        ("spp", lambda image, _: RenderBuffers(Buffer(GREY), spp=image)),
         ("candidate 0, half B", lambda image, _: dip.denoise(NOISY, candidates=[(GREY, image)])),
         ("previous, half A", lambda image, _: dip.denoise(NOISY, previous=(image, GREY))),
         ("image", lambda image, _: dip.compare(image, GREY)),
@@ -93,6 +95,20 @@ def test_images_that_are_no_arrays_of_numbers_are_refused(what, take, image, wor
     with pytest.raises(InputError, match=f"{what}: {words}"):
         take(image, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("spp", [16, np.int64(16), np.float32(16), Fraction(16)])
+def test_samples_per_pixel_may_be_any_number(spp, tmp_path):
+    buffers = replace(NOISY, spp=spp)
+    assert type(buffers.spp) is float
+    dip.write_denoised(tmp_path / "a.exr", RESULT, buffers)
+    assert dip.read_buffers(tmp_path / "a.exr").spp == 16
+
+
+@pytest.mark.parametrize("spp", ["16", 0, -1.0, float("nan"), float("inf"), 2**31, 16j])
+def test_samples_per_pixel_that_are_no_such_number_are_refused(spp):
+    with pytest.raises(InputError, match=r"^spp: expected .*, got "):
+        RenderBuffers(Buffer(GREY), spp=spp)
 
 
 def test_what_is_asked_for_helps():

@@ -198,6 +198,12 @@ def test_variance_of_pbrt_is_that_of_one_sample(tmp_path: Path) -> None:
     assert np.array_equal(buffers.color.variance[..., 1], channels["Variance.G"] / np.float32(16))
 
 
+@pytest.mark.parametrize("count", [-1.0, 0.0, np.nan, np.inf, 1e30])
+def test_an_impossible_number_of_samples_is_ignored(tmp_path: Path, count: float) -> None:
+    save(tmp_path / "a.exr", *"RGB", samplesPerPixel=count)
+    assert read_buffers(tmp_path / "a.exr").spp is None
+
+
 def test_variance_of_unknown_scale_is_taken_only_when_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

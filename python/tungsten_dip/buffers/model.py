@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,6 +35,8 @@ CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 
 
 FEATURES: tuple[Quantity, ...] = ("albedo", "normal", "depth")
 """The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
+
+MOST_SPP = 2**31
 
 _AS_ARRAY = "use numpy.asarray(image, numpy.float32)"
 
@@ -84,8 +87,8 @@ class RenderBuffers:
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
     (None for buffers that are not, or no longer, those of a file).
 
-    Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, or an
-    array is not C-contiguous float32.
+    Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, an
+    array is not C-contiguous float32, or ``spp`` is neither an array nor a number above 0.
     """
 
     color: Buffer
@@ -103,8 +106,12 @@ class RenderBuffers:
             check_type(quantity, buffer, Buffer, "use Buffer(array)")
         if self.alpha is not None:
             check_array("alpha", self.alpha)
-        if isinstance(self.spp, np.ndarray):
-            check_array("spp", self.spp)
+        if isinstance(self.spp, Real):
+            if not 0 < self.spp < MOST_SPP:
+                raise InputError(f"spp: expected a number above 0 and below {MOST_SPP}, got {self.spp!r:.40}")
+            object.__setattr__(self, "spp", float(self.spp))  # numpy's numbers are no attributes of files
+        elif self.spp is not None:
+            check_array("spp", self.spp, "use a number, or an array where it varies")
         expected = self.color.mean.shape[:2]
         for quantity, buffer in self.quantities():
             for plane, array in buffer.planes():

@@ -26,7 +26,7 @@ from tungsten_dip.buffers.layers import (
     mapped_channels,
     names_quantity,
 )
-from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file
@@ -299,7 +299,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         if planes[key] is stacked:
             _share(stacked, [owner[name] for name in names])
     spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
-    spp = float(spp) if isinstance(spp, (int, float)) and spp > 0 else None
+    spp = float(spp) if isinstance(spp, (int, float)) and 0 < spp < MOST_SPP else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
     buffers: dict[str, Any] = {"spp": planes.get("spp", spp)}
