@@ -52,6 +52,7 @@ def test_arrays_of_another_kind_are_refused(half, words):
         (lambda: dip.denoise(RenderBuffers(Buffer(GREY)), "draft"), "settings: expected FitSettings"),
         (lambda: dip.denoise(RenderBuffers(Buffer(GREY)), warm_start="m.onnx"), "warm_start: expected Model"),
         (lambda: dip.infer("m.onnx", RenderBuffers(Buffer(GREY))), "model: expected Model, got str; load_"),
+        (lambda: dip.save_model("m.onnx", None), "model: expected Model, got NoneType; a fit returns it"),
         (lambda: dip.compare(GREY.tolist(), GREY), "image: expected ndarray, got list; read_image reads"),
         (lambda: dip.compare(GREY, "ref.exr"), "reference: expected ndarray, got str; read_image reads"),
     ],

@@ -125,6 +125,24 @@ def test_unknown_quantities_are_told_before_memory_is(quantities: Any, scene_pat
         render(load_scene(scene_path), quantities=quantities)
 
 
+@pytest.mark.parametrize("name", ["spp", "seed", "threads"])
+@pytest.mark.parametrize("value", [1.5, "4", -1, 2**40])
+def test_numbers_that_no_host_can_take_are_told(name: str, value: Any, scene_path: Path) -> None:
+    message = f"{name}: expected a whole number from . to .*, got "
+    with pytest.raises(InputError, match=message):
+        hosts.render(scene_path, host="mitsuba", **{name: value})
+    with pytest.raises(InputError, match=message):
+        tungsten.render(scene_path, **{name: value})
+
+
+def test_numbers_of_numpy_are_numbers_to_every_host(scene_path: Path) -> None:
+    one = np.int64(1)
+    buffers = hosts.render(scene_path, host="mitsuba", spp=one, seed=one, threads=one)  # type: ignore[arg-type]
+    assert buffers.spp == 1
+    options = tungsten.DriverOptions(spp=one, seed=one, threads=one)  # type: ignore[arg-type]
+    assert {type(value) for value in (options.spp, options.seed, options.threads)} == {int}
+
+
 def test_unknown_host(scene_path: Path) -> None:
     with pytest.raises(InputError, match="host: expected one of auto, tungsten, mitsuba, got blender"):
         hosts.render(scene_path, host="blender")  # type: ignore[arg-type]

@@ -482,7 +482,7 @@ def test_cancel_ends_a_path_without_end() -> None:
     ],
 )
 def test_arguments_out_of_range(arguments: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="expected a number"):
+    with pytest.raises(InputError, match="expected a whole number"):
         render_translated(ball(), **arguments)
 
 

@@ -242,8 +242,9 @@ def test_onnxruntime_uses_as_many_threads_as_it_may(
     assert all(providers[-1] == "CPUExecutionProvider" for _, providers in seen)
     with pytest.raises(InputError, match="threads"):
         infer(model, frame.buffers, threads=0)
-    with pytest.raises(InputError, match="refit steps"):
-        infer(model, frame.buffers, refit_steps=-1)
+    for steps in (-1, 1.5, "2", None):
+        with pytest.raises(InputError, match="refit_steps: expected a whole number from 0 to"):
+            infer(model, frame.buffers, refit_steps=steps)  # type: ignore[arg-type]
 
 
 def test_weights_that_overflow_are_refused(model: Model, frame: SyntheticRender) -> None:

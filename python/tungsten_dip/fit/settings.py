@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
@@ -15,7 +15,9 @@ PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 """What the preset ``paper`` alone leaves open."""
 
 
-_WHOLE_NUMBERS = (("iterations", 1, 10**9), ("seed", 0, (1 << 63) - 1), ("threads", 1, 1024))
+MOST_ITERATIONS = 10**9
+
+_WHOLE_NUMBERS = (("iterations", 1, MOST_ITERATIONS), ("seed", 0, (1 << 63) - 1), ("threads", 1, 1024))
 _MOST_SCALES = 8
 _MOST_CHANNELS = 4096
 
@@ -53,11 +55,8 @@ class FitSettings:
                 )
         for name, least, most in _WHOLE_NUMBERS:
             value = getattr(self, name)
-            if value is None:
-                continue
-            if not _is_whole(value, least, most):
-                raise InputError(f"{name}: expected a whole number from {least} to {most}, got {value!r:.40}")
-            object.__setattr__(self, name, int(value))  # JSON cannot represent numpy's numbers
+            if value is not None:
+                object.__setattr__(self, name, whole_number(name, value, least, most))
         for name in ("time_budget_s", "target_error"):
             value = getattr(self, name)
             if value is None:
@@ -66,20 +65,13 @@ class FitSettings:
                 raise InputError(f"{name}: expected a number above 0, got {value!r:.40}")
             object.__setattr__(self, name, float(value))
         counts = self.channels
-        if (
-            not isinstance(counts, tuple)
-            or not 0 < len(counts) <= _MOST_SCALES
-            or not all(_is_whole(n, 1, _MOST_CHANNELS) for n in counts)
-        ):
+        if not isinstance(counts, tuple) or not 0 < len(counts) <= _MOST_SCALES:
             raise InputError(
-                f"channels: expected at most {_MOST_SCALES} counts from 1 to {_MOST_CHANNELS}, such as "
-                f"8,16,32,64,128, got {counts!r:.40}"
+                f"channels: expected 1 to {_MOST_SCALES} counts, such as 8,16,32,64,128, got {counts!r:.40}"
             )
-        object.__setattr__(self, "channels", tuple(map(int, counts)))
+        object.__setattr__(
+            self, "channels", tuple(whole_number("channels", n, 1, _MOST_CHANNELS) for n in counts)
+        )
         for name in PAPER_SETTINGS:
             if self.preset != "paper" and getattr(self, name) != getattr(type(self), name):
                 raise InputError(f"{name}: only the preset paper leaves that open; choose the preset paper")
-
-
-def _is_whole(value: object, least: int, most: int) -> bool:
-    return isinstance(value, Integral) and least <= int(value) <= most

@@ -62,4 +62,6 @@ def render(
             )
         if not isinstance(scene, Scene):
             scene = load_scene(scene)
-        return render_with_mitsuba(scene, spp=spp, seed=seed or 0, threads=threads, progress=progress)
+        return render_with_mitsuba(
+            scene, spp=spp, seed=0 if seed is None else seed, threads=threads, progress=progress
+        )

@@ -19,7 +19,7 @@ import numpy as np
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.hosts.native import BUILD_HINT, executable, render_in_child
 from tungsten_dip.interrupts import requested_interrupts
@@ -53,12 +53,10 @@ class DriverOptions:
     hdr_output_file: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in ("threads", "spp"):
+        for name, least, most in (("threads", 1, 2**31 - 1), ("spp", 1, 2**31 - 1), ("seed", 0, 2**32 - 1)):
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{name}: expected a number above 0, got {value}")
-        if self.seed is not None and not 0 <= self.seed < 2**32:
-            raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {self.seed}")
+            if value is not None:
+                object.__setattr__(self, name, whole_number(name, value, least, most))
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def render(
     folder = None if input_directory is None else Path(input_directory)
     options = DriverOptions(spp=spp, seed=seed, threads=threads, input_directory=folder)
     if _module() is None:
-        given = {"spp": spp, "seed": seed, "threads": threads, "input_directory": folder}
+        given = {name: getattr(options, name) for name in ("spp", "seed", "threads", "input_directory")}
         return render_in_child(Path(scene_path), given, progress)
     session = _load(Path(scene_path), options)
     if _render_passes(session, Path(scene_path), options, None, progress):

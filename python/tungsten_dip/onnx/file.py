@@ -22,7 +22,7 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, numpy_helper
 
 from tungsten_dip.buffers.atomic import check_writable, replacing
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.evidence import Layout
 from tungsten_dip.fit.model import Kind, Model
 from tungsten_dip.fit.pilots import Pilot
@@ -51,8 +51,10 @@ _MOST_CHOICES = 64
 def save_model(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file, whole or not at all.
 
-    Raises InputError if the model is larger than `load_model` accepts, or the file cannot be written.
+    Raises InputError if this is no model, it is larger than `load_model` accepts, or the file cannot be
+    written.
     """
+    check_type("model", model, Model, "a fit returns it as result.model, None if the image has no noise")
     path = Path(path)
     check_writable(path, (".onnx",))
     content = proto_from_model(model).SerializeToString(deterministic=True)

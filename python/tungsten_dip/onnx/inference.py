@@ -10,7 +10,7 @@ import numpy as np
 from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair, thread_count
-from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
@@ -21,7 +21,7 @@ from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.published.images import network_input, paper_images
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
@@ -54,8 +54,7 @@ def infer(
     refit_steps cannot be done.
     """
     check_type("model", model, Model, "load_model reads one from a file")
-    if refit_steps < 0:
-        raise InputError(f"refit steps: expected 0 or more, got {refit_steps}")
+    refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
     settings = _settings(model, threads, refit_steps)
     if model.layout is not None and refit_steps:
         return denoise(

@@ -17,7 +17,7 @@ import numpy as np
 
 from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
@@ -99,11 +99,10 @@ def render_translated(
     With ``timeout_s`` the picture is rendered in passes of ``spp_step``, and no pass begins after that time;
     at least one is rendered, and the buffers tell the spp that were reached.
     """
-    for name, value in (("spp", spp), ("threads", threads), ("spp_step", spp_step)):
-        if value is not None and not 1 <= value < 2**31:
-            raise InputError(f"{name}: expected a number from 1 to {2**31 - 1}, got {value}")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed: expected a number from 0 to {2**32 - 1}, got {seed}")
+    spp = whole_number("spp", spp, 1, 2**31 - 1)
+    spp_step = whole_number("spp_step", spp_step, 1, 2**31 - 1)
+    threads = None if threads is None else whole_number("threads", threads, 1, 2**31 - 1)
+    seed = whole_number("seed", seed, 0, 2**32 - 1)
     started = time.perf_counter()
     with mitsuba_variant() as mitsuba:
         try:
