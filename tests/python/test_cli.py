@@ -117,6 +117,12 @@ def test_denoise_writes_every_file_asked_for(folder, tmp_path, fits, render, cap
     assert "estimated relMSE" in report.read_text()
 
 
+def test_a_report_on_the_working_directory_has_its_name(folder, tmp_path, fits, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert command.main(["denoise", ".", "-o", "../out.exr", "--report", "../page.html"]) == 0
+    assert "<title>buffers" in (tmp_path / "page.html").read_text()
+
+
 def test_the_error_map_lies_where_the_picture_lies(tmp_path, render, fits):
     color = render.buffers.color
     layers = {

@@ -203,7 +203,9 @@ def _denoised(
         result = denoise(buffers)
     write_denoised(options.output, result, buffers, float16=options.float16)
     if options.report is not None:
-        write_report(options.report, options.input.name, buffers, result, DEFAULT_TONEMAP, remarks)
+        # The path "." has no name of its own.
+        name = options.input.absolute().name
+        write_report(options.report, name, buffers, result, DEFAULT_TONEMAP, remarks)
     if options.error_map is not None:
         assert result.error is not None
         write_error_map(options.error_map, result.error, buffers)
