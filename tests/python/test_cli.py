@@ -864,17 +864,28 @@ def test_buffers_are_not_written_over(folder, tmp_path, fits, capfd, plane):
     assert command.main(["denoise", str(single), "-o", str(single)]) == 0  # all layers are in the result
 
 
-@pytest.mark.parametrize("options", [[], ["--json"]])
-def test_a_stdout_that_is_full_is_named(options, folder):
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("tungsten_dip", "inspect {folder}"),
+        ("tungsten_dip", "inspect {folder} --json"),
+        ("tungsten_dip", "compare --help"),
+        ("tungsten_dip", "--version"),
+        ("tungsten", ""),
+    ],
+)
+def test_a_stdout_that_is_full_is_named(name, options, buffered, folder):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-c", MAIN.format("tungsten_dip"), "inspect", str(folder), *options],
+            [sys.executable, "-c", MAIN.format(name), *options.format(folder=folder).split()],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"},
         )
     assert done.returncode == 2
-    assert "stdout: cannot be written (No space left on device); the files are written" in done.stderr
+    assert "stdout: cannot be written (No space left on device); " in done.stderr.splitlines()[-1]
 
 
 def test_ctrl_c_while_libraries_load_is_one_line():

@@ -58,6 +58,11 @@ class Parser(argparse.ArgumentParser):
         """Raise InputError in place of argparse's two lines."""
         raise InputError(f"{message}; see '{self.prog} --help'")
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print the help or the version; argparse says nothing if that fails."""
+        with writing_stdout():
+            print(message, end="", file=file, flush=True)
+
 
 def run(command: str, body: Callable[[], None]) -> int:
     """Run a command's body and return its exit status; whatever goes wrong becomes one line on stderr."""
@@ -70,8 +75,7 @@ def run(command: str, body: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return _fail(command, "interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # The reader of stdout has had enough; Python would complain when it flushes at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _discard_stdout()  # whose reader has had enough
         return EXIT_INTERNAL
     except (InputError, OSError) as error:
         if debug:
@@ -115,6 +119,26 @@ def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
         sys.stdout.flush()
         os.dup2(stdout, 1)
         os.close(stdout)
+
+
+@contextmanager
+def writing_stdout() -> Iterator[None]:
+    """Make what stdout refuses an InputError, unless its reader is gone (see `run`)."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _discard_stdout()
+        raise InputError(
+            f"stdout: cannot be written ({error.strerror}); redirect it elsewhere, any files asked for are "
+            f"written"
+        ) from error
+
+
+def _discard_stdout() -> None:
+    """Let what stdout has not taken go nowhere: Python would complain when it flushes at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 @contextmanager

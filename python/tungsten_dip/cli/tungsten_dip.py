@@ -32,6 +32,7 @@ from tungsten_dip.cli.console import (
     printable,
     progress_on_stderr,
     run,
+    writing_stdout,
 )
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
@@ -64,17 +65,11 @@ def _run(arguments: Sequence[str] | None) -> None:
     options = _parser().parse_args(arguments)
     with json_on_stdout(options.json) as emit:
         facts, text = options.action(options)
-        try:
+        with writing_stdout():
             if options.json:
                 emit(facts)
             else:
                 _print(text)
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise InputError(
-                f"stdout: cannot be written ({error.strerror}); the files are written"
-            ) from error
     if "error" in facts:
         raise InputError(facts["error"])
     if facts.get("interrupted"):
