@@ -545,6 +545,15 @@ def test_images_that_would_be_written_over_one_another_are_refused(
     assert renders == []
 
 
+@pytest.mark.parametrize("name", ["a\0b", "a\ud800"])
+@pytest.mark.parametrize("field", ["output_file", "hdr_output_file", "output_directory"])
+def test_names_that_no_file_can_have_are_one_line(field, name, tmp_path, renders, capfd):
+    suffix = {"output_file": ".png", "hdr_output_file": ".exr", "output_directory": ""}[field]
+    scene = write_scene(tmp_path / "scene.json", **{field: name + suffix})
+    fails(capfd, tungsten.main([str(scene)]), "expected a name that a file can have")
+    assert renders == []
+
+
 def test_the_colour_may_be_named_twice(tmp_path, renders):
     buffers = [{"type": "color", "hdr_output_file": "picture.exr", "two_buffer_variance": True}]
     scene = write_scene(tmp_path / "scene.json", output_buffers=buffers)

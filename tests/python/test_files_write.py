@@ -715,6 +715,15 @@ def test_what_cannot_be_written_is_known_before(tmp_path: Path) -> None:
             write_image(tmp_path / "none" / f"a{suffix}", noise((2, 2, 3)))
 
 
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+@pytest.mark.parametrize("name", ["a\0b", "a\ud800"])
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path, name: str, suffix: str) -> None:
+    path = tmp_path / f"{name}{suffix}"
+    for attempt in (lambda: check_writable(path, (suffix,)), lambda: write_image(path, noise((2, 2, 3)))):
+        with pytest.raises(InputError, match="expected a name that a file can have"):
+            attempt()
+
+
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])
 @pytest.mark.parametrize("missing", [1, 1000])
 def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path: Path, suffix: str, missing: int) -> None:

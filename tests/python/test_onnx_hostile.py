@@ -227,8 +227,9 @@ def test_files_that_are_no_models(tmp_path: Path, saved: Path) -> None:
         with pytest.raises(InputError) as raised:
             load_model(path)
         assert str(path) in str(raised.value)
-    with pytest.raises(InputError, match=r"none\.onnx: cannot be read"):
-        load_model(tmp_path / "none.onnx")
+    for name in ("none", "a\0none", "\ud800none"):
+        with pytest.raises(InputError, match=r"none\.onnx: cannot be read"):
+            load_model(tmp_path / f"{name}.onnx")
     with pytest.raises(InputError, match="expected a file"):
         load_model(tmp_path)
 

@@ -21,10 +21,11 @@ def replacing(path: Path) -> Iterator[Path]:
     it was. A process killed halfway leaves ``path`` as it was too, and a hidden temporary file, which goes
     when ``path`` is next written.
 
-    Raises InputError if the file system refuses (no such folder, read-only, full).
+    Raises InputError if the file system refuses (no such folder, read-only, full), or if no file can have
+    the name.
     """
-    target = _resolved(path)
     try:
+        target = _resolved(path)
         _remove_left_by_the_dead(target)
         with _locked_temporary(target) as temporary:
             yield temporary
@@ -66,6 +67,8 @@ def _resolved(path: Path) -> Path:
         return path.resolve()
     except RuntimeError as error:  # as Python 3.11 and 3.12 have it
         raise InputError(f"{path}: cannot be written (a loop of links); {_REMEDY}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: expected a name that a file can have ({error}); rename it") from error
 
 
 def _temporary(target: Path) -> Path:

@@ -78,8 +78,11 @@ def load_model(path: str | Path) -> Model:
             raise InputError(f"{path}: expected a file, found a folder or device")
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # such as a NUL in the name
+        reason = getattr(error, "strerror", error)
+        raise InputError(f"{path}: cannot be read ({reason}); check the path") from error
     try:
         return _model_from_bytes(content)
     except InputError as error:
