@@ -725,6 +725,23 @@ def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path, name: str, suff
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])
+def test_a_folder_whose_name_is_no_text_is_told_before(tmp_path: Path, suffix: str) -> None:
+    folder = tmp_path / os.fsdecode(b"bad\xff")
+    folder.mkdir()
+    path = folder / f"a{suffix}"
+    attempts = [lambda: check_writable(path, (suffix,)), lambda: write_image(path, noise((2, 2, 3)))]
+    if suffix == ".exr":
+        for attempt in attempts:
+            attempt()
+        return
+    for attempt in attempts:
+        with pytest.raises(InputError, match=rf"bad\udcff/a\{suffix}: expected a folder with a name"):
+            attempt()
+    write_image(tmp_path / os.fsdecode(b"bad\xff" + suffix.encode()), noise((2, 2, 3)))
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])
 @pytest.mark.parametrize("missing", [1, 1000])
 def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path: Path, suffix: str, missing: int) -> None:
     image = np.random.default_rng(0).random((80, 90, 3)).astype(np.float32)

@@ -64,11 +64,20 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
 
 def _resolved(path: Path) -> Path:
     try:
-        return path.resolve()
+        target = path.resolve()
     except RuntimeError as error:  # as Python 3.11 and 3.12 have it
         raise InputError(f"{path}: cannot be written (a loop of links); {_REMEDY}") from error
     except ValueError as error:
         raise InputError(f"{path}: expected a name that a file can have ({error}); rename it") from error
+    if target.suffix.lower() in _IN_FOLDERS_IN_UTF8:
+        try:
+            str(target.parent).encode()
+        except UnicodeEncodeError:
+            raise InputError(
+                f"{path}: expected a folder with a name in UTF-8 for {target.suffix}; rename it, or choose "
+                f"another"
+            ) from None
+    return target
 
 
 def _temporary(target: Path) -> Path:
@@ -114,6 +123,9 @@ def _remove_left_by_the_dead(target: Path) -> None:
                     fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     path.unlink()
 
+
+_IN_FOLDERS_IN_UTF8 = (".png", ".pfm", ".hdr")
+"""What OpenImageIO writes, which takes no other paths. The names of temporary files are always UTF-8."""
 
 _TOKEN_BYTES = 4
 _MOST_OF_STEM_BYTES = 100

@@ -192,7 +192,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")
     spec["pnm:pfmflip"] = 1
     with replacing(path) as temporary:
-        name = _checked_name(temporary)
+        name = str(temporary)
         output = oiio.ImageOutput.create(name)
         pixels = np.ascontiguousarray(image, dtype=np.float32)
         if output is None:
