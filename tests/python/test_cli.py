@@ -493,12 +493,26 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     assert capfd.readouterr().err.splitlines()[-1] == "tungsten: interrupted"
 
 
+@pytest.mark.parametrize("options", [[], ["--dip-denoise"]])
 @pytest.mark.parametrize("second", ["b.json", "sub/../a.json"])
-def test_scenes_that_would_write_over_one_another_are_refused(second, tmp_path, renders, capfd):
+def test_scenes_that_would_write_over_one_another_are_refused(second, options, tmp_path, renders, capfd):
     (tmp_path / "sub").mkdir()
     scenes = [write_scene(tmp_path / name) for name in ("a.json", second)]
-    assert tungsten.main(["--dip-denoise", "--host", "mitsuba", *map(str, scenes)]) != 0
+    assert tungsten.main([*options, "--host", "mitsuba", *map(str, scenes)]) == 2
     assert f"{second}: would write over" in capfd.readouterr().err
+    assert len(renders) == 1
+
+
+@pytest.mark.parametrize(
+    ("shared", "renderer"), [("picture.exr", {"output_buffers": []}), ("n.exr", {"hdr_output_file": ""})]
+)
+def test_scenes_that_share_one_file_alone_are_refused(shared, renderer, tmp_path, renders, capfd):
+    scenes = [
+        str(write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png", **renderer))
+        for name in ("one", "two")
+    ]
+    assert tungsten.main(["--dip-denoise", *scenes]) == 2
+    assert f"two.json: would write over {tmp_path / shared}" in capfd.readouterr().err
     assert len(renders) == 1
 
 
@@ -575,7 +589,14 @@ def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, ca
 
     monkeypatch.setattr("tungsten_dip.sequence.following.Follower", Follower)
     scenes = [
-        str(write_scene(tmp_path / f"f{number}.json", output_file=f"f{number}.png", output_buffers=[]))
+        str(
+            write_scene(
+                tmp_path / f"f{number}.json",
+                output_file=f"f{number}.png",
+                hdr_output_file="",
+                output_buffers=[],
+            )
+        )
         for number in range(3)
     ]
     assert tungsten.main(["--dip-denoise", "--dip-preset", "draft", "--seed", "5", *scenes]) == 0
@@ -842,7 +863,12 @@ def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkey
 
 
 def test_options_may_stand_between_scenes(tmp_path, renders):
-    scenes = [write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png") for name in ("one", "two")]
+    scenes = [
+        write_scene(
+            tmp_path / f"{name}.json", output_file=f"{name}.png", hdr_output_file="", output_buffers=[]
+        )
+        for name in ("one", "two")
+    ]
     assert tungsten.main([str(scenes[0]), "-t", "1", str(scenes[1])]) == 0
     assert (tmp_path / "two.png").exists()
 

@@ -118,11 +118,11 @@ def _run(arguments: Sequence[str] | None) -> None:
         else:
             denoise = _each_alone(settings, warm_start)
     failed = 0
-    denoised: set[Path] = set()
+    written: set[Path] = set()
     for path, seed in zip(options.scenes, seeds, strict=True):
         of_scene = argparse.Namespace(**{**vars(options), "seed": seed})
         try:
-            _render_scene(path, host, of_scene, settings, denoise, denoised)
+            _render_scene(path, host, of_scene, settings, denoise, written)
         except InputError as error:
             if len(options.scenes) == 1:
                 raise
@@ -184,16 +184,16 @@ def _render_scene(
     options: argparse.Namespace,
     settings: FitSettings,
     denoise: Denoise | None,
-    denoised: set[Path],
+    written: set[Path],
 ) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
 
-    ``denoised`` are the denoised pictures of the scenes before, to which this one's are added.
+    ``written`` are the files of the scenes before, to which this one's are added.
 
     Raises InputError if the scene would write over one of those, or as whatever is called here does.
     """
     scene = load_scene(path, options.input_directory)
-    outputs = _checked_outputs(scene, path, options, denoised)
+    outputs = _checked_outputs(scene, path, options, written)
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
@@ -201,8 +201,8 @@ def _render_scene(
             else:
                 buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
         write_render(buffers, unwritten, scene.camera.tonemap)
-        for written in filter(None, (outputs.ldr, outputs.hdr)):
-            _LOG.info("wrote %s", written)
+        for picture in filter(None, (outputs.ldr, outputs.hdr)):
+            _LOG.info("wrote %s", picture)
         if denoise is not None:
             result = denoise(scene.camera, buffers)
             tonemap = scene.camera.tonemap
@@ -210,9 +210,9 @@ def _render_scene(
 
 
 def _checked_outputs(
-    scene: Scene, path: Path, options: argparse.Namespace, denoised: set[Path]
+    scene: Scene, path: Path, options: argparse.Namespace, written: set[Path]
 ) -> SceneOutputs:
-    """Return what a scene writes: all of it can be written, and over no denoised picture."""
+    """Return what a scene writes: all of it can be written, and over no file of the scenes before."""
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
@@ -234,13 +234,13 @@ def _checked_outputs(
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")
-    overwritten = denoised & (rendered | derived)
+    overwritten = written & (rendered | derived)
     if overwritten:
         raise InputError(
             f"{path}: would write over {min(overwritten)}, which belongs to a scene before; give every scene "
-            f"an output_file of its own"
+            f"file names of its own"
         )
-    denoised |= derived
+    written |= rendered | derived
     if options.report is not None:
         check_writable(options.report, (".html",))
     if options.save_model is not None:
