@@ -541,6 +541,28 @@ def test_a_render_that_the_denoised_picture_would_write_over_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("texture", "options"),
+    [
+        ("t.exr", ["-e", "t.exr"]),
+        ("picture.png", []),
+        ("nA.exr", []),
+        ("picture_denoised.png", ["--dip-denoise"]),
+    ],
+)
+def test_what_the_scene_reads_is_not_written_over(
+    texture, options, tmp_path, renders, render, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    write_image(texture, render.reference)
+    before = Path(texture).read_bytes()
+    bsdf = {"name": "grey", "type": "lambert", "albedo": texture}
+    Path("scene.json").write_text(json.dumps({**SCENE, "bsdfs": [bsdf]}))
+    fails(capfd, tungsten.main([*options, "scene.json"]), texture, "one of the files that are read")
+    assert Path(texture).read_bytes() == before
+    assert renders == []
+
+
+@pytest.mark.parametrize(
     ("hdr", "buffers", "words"),
     [
         ("", [("albedo", "picture.exr")], "picture.exr: named for color and for albedo"),
@@ -892,7 +914,7 @@ def test_buffers_are_not_written_over(folder, tmp_path, fits, capfd, plane):
     before = path.read_bytes()
     for options in (["-o", str(path)], ["-o", str(tmp_path / "o.exr"), "--error-map", str(path)]):
         assert command.main(["denoise", str(folder), *options]) == 2
-        fails(capfd, 2, str(path), "one of the buffers")
+        fails(capfd, 2, str(path), "one of the files that are read")
     assert path.read_bytes() == before
     single = tmp_path / "single.exr"
     assert command.main(["denoise", str(folder), "-o", str(single)]) == 0

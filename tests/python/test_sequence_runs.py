@@ -152,7 +152,7 @@ def test_a_result_never_takes_the_place_of_an_input(frames, capsys):
     before = {path: path.read_bytes() for path in Path("noisy").rglob("*.exr")}
     for output in ("noisy/f####/color.exr", "./noisy/f####/albedoB.exr"):
         assert main([*arguments()[:2], "-o", output, "--preset", "draft"]) == 2
-        assert "is one of the buffers that are read" in capsys.readouterr().err
+        assert "is one of the files that are read" in capsys.readouterr().err
     # Another frame's input is an input as well.
     color = frames / "noisy/f0000/color.exr"
     color.symlink_to(color.rename(frames / "color2.exr"))

@@ -72,7 +72,7 @@ def check_no_input(outputs: Iterable[Path | None], inputs: Collection[Path]) -> 
     """Raise InputError if one of the outputs, where they are named, is among the resolved inputs."""
     for path in outputs:
         if path is not None and path.resolve() in inputs:
-            raise InputError(f"{path}: is one of the buffers that are read; name another file")
+            raise InputError(f"{path}: is one of the files that are read; name another file")
 
 
 def denoise_with_progress(

@@ -16,6 +16,7 @@ from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     REPORT_HELP,
     add_fit_options,
+    check_no_input,
     denoise_with_progress,
     fit_settings,
     load_warm_start,
@@ -212,7 +213,7 @@ def _render_scene(
 def _checked_outputs(
     scene: Scene, path: Path, options: argparse.Namespace, written: set[Path]
 ) -> SceneOutputs:
-    """Return what a scene writes: all of it can be written, and over no file of the scenes before."""
+    """Return what a scene writes: it can be written, over no input and over no file of the scenes before."""
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
@@ -231,6 +232,7 @@ def _checked_outputs(
     for file in own:
         check_writable(file, (file.suffix,))
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
+    check_no_input(sorted(rendered | derived), {file.resolve() for file in scene.files})
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")

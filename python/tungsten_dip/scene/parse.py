@@ -144,7 +144,7 @@ class _MissingFileError(InputError):
 
 
 class _Parser:
-    """The state while reading: the objects declared so far, and the fields ignored."""
+    """The state while reading: the objects declared and the files named so far, and the fields ignored."""
 
     def __init__(self, path: Path, input_directory: Path | None) -> None:
         self.path = path
@@ -154,6 +154,7 @@ class _Parser:
         self.missing: list[_MissingFileError] = []
         self.nested_bsdfs: dict[Bsdf, int] = {}
         self.ignored: Counter[str] = Counter()
+        self.files: set[Path] = set()
 
     def fail(self, where: str, expected: str, got: object, remedy: str) -> InputError:
         return InputError(f"{self.path}: {where}: expected {expected}, got {shown(got)}; {remedy}")
@@ -197,7 +198,8 @@ class _Parser:
             _LOG.warning("%s: fields that Tungsten does not read are ignored: %s", self.path, listed[:500])
         for error in self.missing:
             _LOG.warning("%s (ignored: nothing uses it)", error)
-        return Scene(path=self.path, input_directory=self.input_directory, **parts)
+        files = frozenset(self.files)
+        return Scene(path=self.path, input_directory=self.input_directory, files=files, **parts)
 
     # --- Values by annotation ---
 
@@ -293,6 +295,7 @@ class _Parser:
                 f"{self.path}: {where}: expected a file, found none at {str(path)!r:.300}; "
                 "put it there or correct the name"
             )
+        self.files.add(path)
         return path
 
     def matrix(self, value: Any, where: str) -> Matrix:

@@ -979,11 +979,12 @@ class Renderer:
 class Scene:
     """A scene file; ``path`` is where it was read from, ``input_directory`` where the files it names are.
 
-    None: beside it.
+    None: beside it. ``files`` are all that it names (textures, meshes, ...), whether they are used or not.
     """
 
     path: Path
     input_directory: Path | None = None
+    files: frozenset[Path] = frozenset()
     media: tuple[Medium, ...] = ()
     bsdfs: tuple[Bsdf, ...] = ()
     primitives: tuple[Primitive, ...] = ()
