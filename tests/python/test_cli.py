@@ -628,6 +628,13 @@ def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, ca
     assert [call["seed"] for call in renders] == [5, 6, 7]
 
 
+def test_the_seed_after_the_largest_is_0(tmp_path, renders, fits):
+    rest = {"hdr_output_file": "", "output_buffers": []}
+    scenes = [str(write_scene(tmp_path / f"{n}.json", output_file=f"{n}.png", **rest)) for n in range(3)]
+    assert tungsten.main(["--dip-denoise", "--dip-preset", "draft", "--seed", str(2**32 - 1), *scenes]) == 0
+    assert [call["seed"] for call in renders] == [2**32 - 1, 0, 1]
+
+
 def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_path, renders, capfd):
     broken = tmp_path / "broken.json"
     broken.write_text("{")

@@ -115,7 +115,8 @@ def _run(arguments: Sequence[str] | None) -> None:
         if len(options.scenes) > 1 and settings.preset != "paper":
             denoise = _frame_after_frame(settings, warm_start)
             # The same noise in every frame would not average out.
-            seeds = [options.seed, *((options.seed or 0) + index for index in range(1, len(seeds)))]
+            first = options.seed or 0
+            seeds = [options.seed, *((first + index) % 2**32 for index in range(1, len(seeds)))]
         else:
             denoise = _each_alone(settings, warm_start)
     failed = 0
