@@ -988,10 +988,12 @@ def test_ctrl_c_that_is_ignored_does_not_end_a_render(scene):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_working_directory_that_is_gone_is_one_line(scene, tmp_path):
+@pytest.mark.parametrize("folder", [[], ["-d", "{tmp}/out"]])
+def test_a_working_directory_that_is_gone_is_one_line(folder, scene, tmp_path):
     (tmp_path / "gone").mkdir()
     program = MAIN.format("tungsten").replace("sys.exit", "import os; os.rmdir(os.getcwd()); sys.exit")
-    arguments = ["--host", "mitsuba", "--spp", "1", "-d", str(tmp_path / "out"), str(scene)]
+    folder = [word.format(tmp=tmp_path) for word in folder]
+    arguments = ["--host", "mitsuba", "--spp", "1", *folder, str(scene)]
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments], cwd=tmp_path / "gone", capture_output=True, text=True
     )

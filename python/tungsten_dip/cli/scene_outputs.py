@@ -23,10 +23,10 @@ _HDR = RADIANCE_SUFFIXES
 
 @dataclass(frozen=True)
 class SceneOutputs:
-    """Absolute paths of what one scene writes.
+    """Paths of what one scene writes.
 
     ``ldr`` (PNG) and ``hdr`` are the picture itself, None where it is not asked for; ``buffers`` are the
-    scene's ``output_buffers``, their file names made absolute.
+    scene's ``output_buffers``, their file names with their folder.
     """
 
     ldr: Path | None
@@ -35,7 +35,7 @@ class SceneOutputs:
 
     def beside(self, suffix: str) -> Path:
         """Return the path of a file beside the picture: its name without extension, then ``suffix``."""
-        picture = self.ldr or self.hdr or Path.cwd() / "TungstenRender"
+        picture = self.ldr or self.hdr or Path("TungstenRender")
         return picture.with_name(picture.stem + suffix)
 
     def with_both_pictures(self) -> SceneOutputs:
@@ -93,7 +93,7 @@ def scene_outputs(
     """
     renderer = scene.renderer
     folder = output_directory or input_directory / renderer.output_directory
-    own_folder = output_directory or Path.cwd()
+    own_folder = output_directory or Path()
 
     def placed(own: Path | None, name: str) -> Path | None:
         return own_folder / own if own else folder / name if name else None
