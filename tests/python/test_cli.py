@@ -16,7 +16,14 @@ import pytest
 
 import tungsten_dip
 from conftest import SCENE
-from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
+from tungsten_dip.buffers import (
+    Buffer,
+    RenderBuffers,
+    read_buffers,
+    read_image,
+    write_image,
+    write_tungsten_folder,
+)
 from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import console, entry, tungsten
@@ -417,6 +424,24 @@ def test_pictures_of_unknown_types_are_written_as_known_ones(tmp_path, renders, 
     assert tungsten.main(["--host", "mitsuba", str(scene)]) == 0
     written = {path.name for path in tmp_path.iterdir()} - {scene.name}
     assert written == {"a.png", "b.exr", "albedo.hdr", "normal.exr", "depth.exr"}
+
+
+def test_buffers_of_unknown_types_are_found_as_what_they_were_written(tmp_path, renders):
+    buffers = [{"type": "normal", "hdr_output_file": "n.tif"}]
+    scene = write_scene(tmp_path / "scene.json", hdr_output_file="b.v2", output_buffers=buffers)
+    assert tungsten.main(["--host", "mitsuba", str(scene)]) == 0
+    buffers = read_buffers(scene)
+    assert np.array_equal(buffers.color.mean, read_image(tmp_path / "b.exr"))
+    assert np.array_equal(buffers.normal.mean, read_image(tmp_path / "n.exr"))
+
+
+@pytest.mark.parametrize("name", ["sub/", "sub/.png", ".PNG", ".", ".."])
+def test_a_name_of_no_file_is_refused(name, tmp_path, renders, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    write_scene(Path("scene.json"), output_file=name)
+    fails(capfd, tungsten.main(["--dip-denoise", "scene.json"]), f"{name}: expected the name of a file")
+    assert renders == []
 
 
 def test_a_picture_that_does_not_fit_into_memory_is_one_line(scene, capfd, monkeypatch):

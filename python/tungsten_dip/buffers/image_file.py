@@ -61,6 +61,11 @@ def radiance_suffixes(quantity: Quantity) -> tuple[str, ...]:
     return tuple(suffix for suffix in RADIANCE_SUFFIXES if quantity != "normal" or suffix != ".hdr")
 
 
+def with_known_suffix(path: Path, suffixes: tuple[str, ...] = RADIANCE_SUFFIXES) -> Path:
+    """Return where a file that a scene names is written: with the first suffix if it has none of these."""
+    return path if path.suffix.lower() in suffixes else path.with_suffix(suffixes[0])
+
+
 def read_parts(path: Path) -> tuple[Part, ...]:
     """Read every part of an .exr file, or the one image of a .pfm or .hdr file. Mipmaps are left out.
 

@@ -15,7 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, read_parts
+from tungsten_dip.buffers.image_file import (
+    RADIANCE_SUFFIXES,
+    radiance_suffixes,
+    read_parts,
+    with_known_suffix,
+)
 from tungsten_dip.buffers.layers import (
     MAP_KEYS,
     NOTHING,
@@ -155,7 +160,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
             if quantity not in CHANNELS or not name:
                 ignored.append(f"output buffer {quantity} without hdr_output_file or of unknown type")
                 continue
-            file = folder / name
+            file = with_known_suffix(folder / name, radiance_suffixes(quantity))
             wanted = [""]
             wanted += ["A", "B"] if request.get("two_buffer_variance", False) else []
             wanted += ["Variance"] if request.get("sample_variance", False) else []
@@ -163,7 +168,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
                 quantity + suffix: file.with_name(file.stem + suffix + file.suffix) for suffix in wanted
             }
         if "color" not in files and renderer.get("hdr_output_file"):
-            files["color"] = folder / renderer["hdr_output_file"]
+            files["color"] = with_known_suffix(folder / renderer["hdr_output_file"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected renderer.output_buffers such as "

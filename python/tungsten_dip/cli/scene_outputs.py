@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
-from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes
+from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName
@@ -117,11 +117,21 @@ def scene_outputs(
 
 
 def _known(name: str, suffixes: tuple[str, ...]) -> str:
-    """Return a scene's name of a file, of another type where that cannot be written."""
-    if not Path(name).name or Path(name).suffix.lower() in suffixes:
+    """Return a scene's name of a file, of another type where that cannot be written.
+
+    Raises InputError if it names no file.
+    """
+    if not name:
         return name
-    written = str(Path(name).with_suffix(suffixes[0]))
-    _LOG.warning("%s: expected a name that ends in %s; written as %s", name, " or ".join(suffixes), written)
+    if name.endswith("/") or Path(name).name.lower() in ("", "..", *suffixes):
+        raise InputError(
+            f"{name}: expected the name of a file such as picture{suffixes[0]}; correct the scene"
+        )
+    written = str(with_known_suffix(Path(name), suffixes))
+    if written != str(Path(name)):
+        _LOG.warning(
+            "%s: expected a name that ends in %s; written as %s", name, " or ".join(suffixes), written
+        )
     return written
 
 
