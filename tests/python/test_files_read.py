@@ -521,6 +521,23 @@ def test_a_scene_names_its_buffers(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert "color: no cA.exr, cB.exr, cVariance.exr" in caplog.text
 
 
+def test_features_of_a_later_render_are_not_mixed_with_the_picture_of_an_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "scene.json"
+    renderer = {
+        "hdr_output_file": "c.exr",
+        "overwrite_output_files": False,
+        "output_buffers": [{"type": "normal", "hdr_output_file": "n.exr"}],
+    }
+    path.write_text(json.dumps({"renderer": renderer}))
+    for name in ("c", "n"):
+        save(tmp_path / f"{name}.exr", *"RGB")
+    read_buffers(path)
+    save(tmp_path / "c001.exr", *"RGB")
+    refused(path, "expected one picture beside its buffers, found c001.exr, too; .* alone, as c.exr")
+    path.write_text(json.dumps({"renderer": {**renderer, "overwrite_output_files": True}}))
+    read_buffers(path)
+
+
 def test_a_scene_may_hold_comments_and_trailing_commas(tmp_path: Path) -> None:
     write_image(tmp_path / "c.exr", np.full((2, 3, 3), 0.5, np.float32))
     buffers = '[{"type": "color", "hdr_output_file": "c.exr"},]'

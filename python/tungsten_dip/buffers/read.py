@@ -155,6 +155,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
         requests = renderer.get("output_buffers", [])
         files: dict[str, Path] = {}
         ignored = []
+        later = None
         for request in requests:
             quantity, name = request["type"], request.get("hdr_output_file")
             if quantity not in CHANNELS or not name:
@@ -168,7 +169,9 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
                 quantity + suffix: file.with_name(file.stem + suffix + file.suffix) for suffix in wanted
             }
         if "color" not in files and renderer.get("hdr_output_file"):
-            files["color"] = with_known_suffix(folder / renderer["hdr_output_file"])
+            picture = files["color"] = with_known_suffix(folder / renderer["hdr_output_file"])
+            if not renderer.get("overwrite_output_files", True):
+                later = picture.with_name(f"{picture.stem}001{picture.suffix}")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected renderer.output_buffers such as "
@@ -178,6 +181,12 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
         raise InputError(
             f'{path}: saves no colour; add {{"type": "color", "hdr_output_file": "color.exr"}} to '
             "renderer.output_buffers and render"
+        )
+    if later is not None and later.exists():
+        # Pictures are numbered, buffers are not: those there are of the last render.
+        raise InputError(
+            f"{path}: expected one picture beside its buffers, found {later.name}, too; keep that of the "
+            f"last render alone, as {files['color'].name}"
         )
     for quantity in CHANNELS:
         noise = [key for suffix in _SUFFIXES[1:] if (key := quantity + suffix) in files]
