@@ -1026,6 +1026,20 @@ def test_a_working_directory_that_is_gone_is_one_line(folder, scene, tmp_path):
     assert "tungsten: the working directory does not exist any more" in done.stderr.splitlines()[-1]
 
 
+def test_renders_in_a_working_directory_whose_name_is_no_text(scene, tmp_path):
+    folder = tmp_path / os.fsdecode(b"bad\xff")
+    folder.mkdir()
+    arguments = ["--host", "mitsuba", "--spp", "1", "-d", str(tmp_path / "out"), str(scene)]
+    done = subprocess.run(
+        [sys.executable, "-c", MAIN.format("tungsten"), *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "picture.exr").exists()
+
+
 def test_ctrl_c_waits_for_an_import():
     reached = []
 

@@ -53,7 +53,8 @@ def mitsuba_variant() -> Iterator[ModuleType]:
         previous_variant = mitsuba.variant()
         mitsuba.set_variant(VARIANT)
     resolver = mitsuba.file_resolver()
-    if str(_PLUGIN_PARENT) not in [str(path) for path in resolver]:
+    # Not compared as texts: a working directory whose name is not UTF-8 is none.
+    if mitsuba.filesystem.path(str(_PLUGIN_PARENT)) not in list(resolver):
         resolver.append(str(_PLUGIN_PARENT))
     logger = mitsuba.logger()
     previous_appenders = [logger.appender(i) for i in range(logger.appender_count())]
