@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -1007,6 +1008,13 @@ def test_a_broken_image_is_one_line_that_names_it(folder: Path) -> None:
     with pytest.raises(InputError, match=r"broken\.png") as error:
         render(folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": "broken.png"}}])
     assert "\n" not in str(error.value)
+
+
+def test_a_texture_whose_name_is_no_text_is_one_line(folder: Path) -> None:
+    texture = os.fsdecode(b"bad\xff.png")
+    (folder / "colour.png").rename(folder / texture)
+    with pytest.raises(InputError, match=r"bad\udcff\.png: expected a name in UTF-8; rename it"):
+        render(folder, [{"type": "quad", "bsdf": {"type": "lambert", "albedo": texture}}])
 
 
 def test_an_image_too_large_for_memory_is_one_line_that_names_it(

@@ -112,7 +112,7 @@ def first_pixel(path: Path) -> tuple[int, int] | None:
 
 def is_whole(path: Path) -> bool:
     """Whether every part of an .exr file that was written by rows can be read to its end, its last row."""
-    image = oiio.ImageInput.open(_checked_name(path))
+    image = oiio.ImageInput.open(checked_name(path))
     if image is None:
         oiio.geterror()  # is printed at exit otherwise
         return False
@@ -214,7 +214,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
             raise OSError("the end of the file is missing")
 
 
-def _checked_name(path: Path) -> str:
+def checked_name(path: Path) -> str:
     """Return the path as OpenImageIO takes it. Raises InputError if the name is no UTF-8."""
     try:
         str(path).encode()
@@ -226,7 +226,7 @@ def _checked_name(path: Path) -> str:
 def _decoded(path: Path) -> tuple[Part, ...]:
     config = oiio.ImageSpec()
     config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
-    image = oiio.ImageInput.open(_checked_name(path), config)
+    image = oiio.ImageInput.open(checked_name(path), config)
     if image is None:
         raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
     try:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO
 
-from tungsten_dip.buffers.image_file import MAX_PIXELS, RADIANCE_SUFFIXES
+from tungsten_dip.buffers.image_file import MAX_PIXELS, RADIANCE_SUFFIXES, checked_name
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant, transform_uv
 from tungsten_dip.scene.types import (
@@ -190,7 +190,7 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     hdr = texture.file.suffix.lower() in RADIANCE_SUFFIXES
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
-    image = OpenImageIO.ImageInput.open(str(texture.file), config)
+    image = OpenImageIO.ImageInput.open(checked_name(texture.file), config)
     if image is None:
         reason = " ".join(OpenImageIO.geterror().split())
         raise InputError(f"{texture.file}: expected an image for a texture ({reason}); check the file")
