@@ -32,6 +32,7 @@ from tungsten_dip.buffers import (
     replacing,
     write_denoised,
     write_image,
+    write_text,
     write_tungsten_folder,
 )
 from tungsten_dip.buffers.image_file import write_exr
@@ -678,6 +679,11 @@ def test_names_may_be_as_long_as_the_file_system_lets_them(tmp_path: Path, lette
         write_image(path, noise((2, 3, 3), seed))
         assert list(tmp_path.iterdir()) == [path]
         assert np.array_equal(read_image(path), noise((2, 3, 3), seed))
+
+
+def test_a_name_that_is_no_text_is_escaped_in_a_text(tmp_path: Path) -> None:
+    write_text(tmp_path / "page.html", os.fsdecode(b"<h1>K\xfcche</h1>"))
+    assert (tmp_path / "page.html").read_text() == r"<h1>K\udcfcche</h1>"
 
 
 def test_a_link_stays_a_link_and_the_umask_holds(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -539,6 +540,15 @@ def test_names_in_other_encodings_still_name(tmp_path):
     path = tmp_path / "scene.json"
     path.write_bytes(json.dumps(scene, ensure_ascii=False).encode("latin-1"))
     assert load_scene(path).primitives[0].bsdf.kind == "mirror"
+
+
+def test_files_in_other_encodings_are_found(tmp_path):
+    mesh = tmp_path / os.fsdecode(b"Fu\xdfboden.obj")
+    mesh.touch()
+    scene = {"primitives": [{"type": "mesh", "file": "Fu\xdfboden.obj"}]}
+    path = tmp_path / "scene.json"
+    path.write_bytes(json.dumps(scene, ensure_ascii=False).encode("latin-1"))
+    assert load_scene(path).primitives[0].file == mesh
 
 
 def test_a_scene_in_a_zip_says_what_to_do(tmp_path):

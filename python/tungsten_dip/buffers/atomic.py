@@ -37,12 +37,12 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8, whole or not at all.
+    """Write a text as UTF-8, whole or not at all; what is no UTF-8 of the names of files is escaped.
 
     Raises InputError if the file system refuses.
     """
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
