@@ -371,6 +371,18 @@ def test_a_scheduler_that_does_not_answer_is_one_line(frames, capsys, monkeypatc
     assert "no scheduler answers" in capsys.readouterr().err
 
 
+def test_local_workers_that_do_not_start_are_one_line(frames, capsys, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+
+    def local_cluster(**_):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(distributed, "LocalCluster", local_cluster)
+    assert main(arguments("--workers", "2")) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "--workers 2: they do not start (Nanny failed to start.); use fewer, or allow more open" in last
+
+
 def test_a_scheduler_without_workers_is_one_line(frames, capsys, monkeypatch):
     distributed = pytest.importorskip("distributed")
     from tungsten_dip.sequence import cluster as module

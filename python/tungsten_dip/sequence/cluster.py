@@ -59,7 +59,7 @@ def denoise_on_cluster(
     share the cores, and others use one core each. Returns the records of all frames, in their order, and the
     networks that they shared.
 
-    Raises InputError if Dask is not installed or the scheduler does not answer.
+    Raises InputError if Dask is not installed, the scheduler does not answer or local workers do not start.
     """
     Follower(run.settings, run.refit, models)  # which checks them, before any worker starts
     frames = [_absolute(frame) for frame in frames]
@@ -136,14 +136,20 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler == "local":
         with dask.config.set(_LOCAL_WORKERS), _safe_path(), ExitStack() as stack:
-            with _interrupts_blocked():
-                cluster = LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                )
-                client = stack.enter_context(Client(stack.enter_context(cluster)))
+            try:
+                with _interrupts_blocked():
+                    cluster = LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        dashboard_address=None,
+                        silence_logs=logging.CRITICAL,
+                    )
+                    client = stack.enter_context(Client(stack.enter_context(cluster)))
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"--workers {workers}: they do not start ({error}); use fewer, or allow more open files "
+                    f"(ulimit -n)"
+                ) from error
             yield client
         return
     try:
