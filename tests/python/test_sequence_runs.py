@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -128,6 +129,18 @@ def test_a_frame_is_done_again_where_anything_that_made_it_has_changed(frames, m
     work.denoise_frames([frame], RUN)
     assert work.finished(frame, RUN) is not None
     assert work.finished(frame, changed(monkeypatch)) is None
+
+
+def test_a_frame_is_done_again_where_its_input_is_that_of_another_take(frames):
+    shutil.copytree("noisy", "other")  # times as well
+    Path("link").symlink_to("noisy")
+    known, same, other = (
+        find_frames(f"{take}/f####", "out/f####.exr", (0,))[0] for take in ("noisy", "link", "other")
+    )
+    work.denoise_frames([known], RUN)
+    assert work.finished(known, RUN) is not None
+    assert work.finished(same, RUN) is not None
+    assert work.finished(other, RUN) is None
 
 
 def test_a_frame_that_was_skipped_is_none_to_flicker_against(frames):

@@ -166,7 +166,8 @@ def _key(frame: Frame, run: Run) -> str:
     if frame.scene is not None:
         files.append(frame.scene)
     try:
-        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+        # By their paths: files of two takes may be alike in all else. One that has moved may be another one.
+        stats = [(file.stat().st_size, file.stat().st_mtime_ns, str(file.resolve())) for file in files]
     except OSError as error:
         raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
     settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
