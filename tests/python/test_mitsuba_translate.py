@@ -429,6 +429,19 @@ def test_a_mirrored_sphere_is_seen_from_without(folder: Path) -> None:
     np.testing.assert_allclose(buffers.normal.mean[:, :, 2], 1.0, atol=0.02)
 
 
+@pytest.mark.parametrize("kind", ["quad", "cube", "mesh"])
+@pytest.mark.parametrize("place", [{"scale": 1e-20}, {"scale": 1e-6, "position": [99, 99, 99]}])
+def test_a_light_without_area_lights_nothing(kind: str, place: Json, folder: Path) -> None:
+    light = {"type": kind, "bsdf": GREY, "emission": 1.0, "transform": place}
+    files = {"file": "mesh.obj", "smooth": True} if kind == "mesh" else {}
+    picture = render(folder, [FLOOR, {**light, **files}]).color.mean
+    assert not picture.any()
+
+
+def test_a_light_whose_area_is_beyond_floats_is_no_warning(folder: Path) -> None:
+    render(folder, [{"type": "cube", "bsdf": GREY, "emission": 1.0, "transform": {"scale": 1e20}}])
+
+
 def test_a_smooth_mesh_shines_on_the_side_of_its_faces(folder: Path) -> None:
     # The vertex normals point against the winding.
     (folder / "lamp.obj").write_text(

@@ -278,6 +278,15 @@ def _triangles(
 ) -> Any:
     """Return a mesh with the vertices that its triangles use."""
     used, indices = np.unique(triangles, return_inverse=True)
+    indices = indices.reshape(-1, 3)
+    vertices = positions[used].astype(np.float32)
+    if "emitter" in node:
+        first, second = (vertices[indices[:, corner]] - vertices[indices[:, 0]] for corner in (1, 2))
+        with np.errstate(over="ignore", invalid="ignore"):
+            areas = np.linalg.norm(np.cross(first, second), axis=1)
+        if not areas.any():
+            # Mitsuba refuses it. A small light far from the origin has no area in float32 either.
+            node = {name: value for name, value in node.items() if name != "emitter"}
     props = mi.Properties()
     for name, value in node.items():
         props[name] = mi.load_dict(value) if isinstance(value, dict) else value
@@ -286,7 +295,7 @@ def _triangles(
     mesh = mi.Mesh("mesh", len(used), len(triangles), props, normals is not None, True)
     params = mi.traverse(mesh)
     params["faces"] = indices.astype(np.uint32).ravel()
-    params["vertex_positions"] = positions[used].astype(np.float32).ravel()
+    params["vertex_positions"] = vertices.ravel()
     if normals is not None:
         params["vertex_normals"] = normals[used].astype(np.float32).ravel()
     params["vertex_texcoords"] = uv[used].astype(np.float32).ravel()
