@@ -41,6 +41,9 @@ VARIANTS: dict[str, Change] = {
     "hardly trained (1 step)": lambda: mock.patch.object(
         fusion, "_PRESETS", {"balanced": replace(fusion._PRESETS["balanced"], steps=1)}
     ),
+    "one network instead of two": lambda: mock.patch.object(
+        fusion, "_PRESETS", {"balanced": replace(fusion._PRESETS["balanced"], members=1)}
+    ),
     "one pilot and the noisy image": _with_one_pilot,
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
     "only guided pilots": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
