@@ -12,6 +12,7 @@ from conftest import MakeRender, SyntheticRender
 from tungsten_dip.fit import FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import Evidence, Indices
 from tungsten_dip.fit.pointwise import HIDDEN, Examples, PointwiseNetwork
+from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import LEARNING_RATE
 
 
@@ -73,11 +74,14 @@ def test_steps_get_smaller_towards_the_end_of_the_time_budget(
     assert rates[-1] < 0.02 * LEARNING_RATE
 
 
-@pytest.mark.parametrize(("time_budget_s", "members"), [(None, 6), (1e6, 1)])
-def test_final_has_one_member_under_a_time_budget(
-    time_budget_s: float | None, members: int, make_render: MakeRender
+@pytest.mark.parametrize(
+    ("preset", "time_budget_s", "members", "steps"),
+    [("balanced", None, 2, 160), ("balanced", 1e6, 1, 240), ("final", None, 6, 240), ("final", 1e6, 1, 240)],
+)
+def test_a_time_budget_is_spent_on_one_network(
+    preset: Preset, time_budget_s: float | None, members: int, steps: int, make_render: MakeRender
 ) -> None:
-    settings = FitSettings("final", iterations=1, time_budget_s=time_budget_s, threads=1)
-    model = denoise(make_render(16, 24).buffers, settings).model
-    assert model is not None
-    assert np.shape(model.weights["layer1.bias"]) == (members * HIDDEN,)
+    result = denoise(make_render(16, 24).buffers, FitSettings(preset, time_budget_s=time_budget_s, threads=1))
+    assert result.model is not None
+    assert np.shape(result.model.weights["layer1.bias"]) == (members * HIDDEN,)
+    assert result.iterations == steps

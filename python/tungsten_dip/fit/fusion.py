@@ -45,6 +45,9 @@ _SMALL_BATCH_PIXELS = 1 << 13
 """Enough for the pilots of draft, and beside a previous frame; with more of them the rims of lamps, few
 pixels, come out worse."""
 
+_STEPS_OF_ONE = 240
+"""Of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
+
 _POLL_S = 0.1
 
 
@@ -88,9 +91,7 @@ def fit_fusion(
     layout = None if warm_start is None else warm_start.layout
     pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
     evidence = evidence_from_buffers(halved, settings, pilots, clock, progress, previous, layout)
-    # A time budget is better spent on the steps of one.
-    members = preset.members if settings.time_budget_s is None else 1
-    start = start_of_training(evidence, settings.seed, warm_start, members)
+    start = start_of_training(evidence, settings.seed, warm_start, preset.members)
     evidence = start.evidence
     network = PointwiseNetwork(
         start.weights,
@@ -128,10 +129,13 @@ def fit_fusion(
 
 def _preset(settings: FitSettings, following: bool) -> _Preset:
     preset = _PRESETS[settings.preset]
-    if not following:
-        return preset
-    # The previous frame moved into place has no counterpart among the pilots of all samples.
-    return _Preset(preset.following, preset.steps, _SMALL_BATCH_PIXELS, all_samples=False)
+    if preset.members > 1 and (following or settings.time_budget_s is not None):
+        # What time there is is better spent on the steps of one network.
+        preset = replace(preset, members=1, steps=_STEPS_OF_ONE)
+    if following:
+        # The previous frame moved into place has no counterpart among the pilots of all samples.
+        preset = replace(preset, pilots=preset.following, batch_pixels=_SMALL_BATCH_PIXELS, all_samples=False)
+    return preset
 
 
 def blends_all_samples(settings: FitSettings, following: bool) -> bool:
