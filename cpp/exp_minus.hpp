@@ -8,7 +8,7 @@
 
 namespace tungsten_dip {
 
-// exp(-x) - 1e-18 for 0 <= x < 41 to a relative error below 1e-5, then 0: the whole part of the binary
+// exp(-x) to a relative error below 1e-5, less 1e-18, but never negative: the whole part of the binary
 // logarithm becomes the exponent's bits, and a polynomial gives 2^fraction.
 inline float exp_minus(float x) {
     // Sums of smaller weights are denormal, with which many processors compute a hundred times as slowly.

@@ -29,8 +29,11 @@ def object_from_json_file(path: Path) -> dict[str, Any]:
         found = "a zip on the way to it" if in_zip else "a folder" if path.is_dir() else "none"
         remedy = "unpack it" if in_zip else "check the path"
         raise InputError(f"{path}: expected a Tungsten scene file, found {found}; {remedy}")
-    # Tungsten takes any bytes for a name; those that are not UTF-8 are kept as Python keeps them in paths.
-    text = content.decode("utf-8-sig", "surrogateescape")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # As old programs on Windows write it. The files that it names mostly have names in UTF-8 here.
+        text = content.decode("latin-1")
 
     repeated: set[str] = set()
 

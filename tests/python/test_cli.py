@@ -1,3 +1,4 @@
+import importlib
 import io
 import json
 import logging
@@ -29,6 +30,8 @@ from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import console, entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes, progress_on_stderr
+from tungsten_dip.cli.scene_outputs import SceneOutputs, write_render
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
@@ -43,6 +46,12 @@ def write_scene(path, **renderer):
     scene = {**SCENE, "renderer": {**SCENE["renderer"], **renderer}}
     path.write_text(json.dumps(scene))
     return path
+
+
+def write_frames(folder, *names):
+    """Write scenes that make pictures alone, each of its own name; return their paths."""
+    files = {"hdr_output_file": "", "output_buffers": []}
+    return [write_scene(folder / f"{name}.json", output_file=f"{name}.png", **files) for name in names]
 
 
 @pytest.fixture
@@ -490,12 +499,7 @@ def test_the_number_is_free_for_every_picture(removed, tmp_path, renders, fits):
 def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     tmp_path, renders, fits, capfd, monkeypatch
 ):
-    scenes = [
-        write_scene(
-            tmp_path / f"{name}.json", output_file=f"{name}.png", hdr_output_file="", output_buffers=[]
-        )
-        for name in ("one", "two", "three")
-    ]
+    scenes = write_frames(tmp_path, "one", "two", "three")
     finished = tungsten_dip.fit.denoise
 
     def interrupted(buffers, settings, progress, warm_start=None, previous=None):
@@ -526,6 +530,31 @@ def test_scenes_that_would_write_over_one_another_are_refused(second, options, t
     assert tungsten.main([*options, "--host", "mitsuba", *map(str, scenes)]) == 2
     assert f"{second}: would write over" in capfd.readouterr().err
     assert len(renders) == 1
+
+
+def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capfd, monkeypatch):
+    render, seen = importlib.import_module("tungsten_dip.hosts.mitsuba.render").render, []
+
+    def fails_at_first(scene, **options):
+        seen.append(scene)
+        if len(seen) == 1:
+            raise InputError("a light that there is not")
+        return render(scene, **options)
+
+    monkeypatch.setattr("tungsten_dip.hosts.mitsuba.render.render", fails_at_first)
+    scenes = [str(write_scene(tmp_path / name)) for name in ("a.json", "b.json")]
+    assert tungsten.main(["--host", "mitsuba", *scenes]) == 2
+    assert "1 of 2 scenes failed" in capfd.readouterr().err
+    assert len(renders) == 1
+
+
+def test_negative_radiance_is_black_in_a_hdr_and_loses_no_render(tmp_path, caplog):
+    radiance = np.full((2, 3, 3), 0.5, np.float32)
+    radiance[0, 0] = -0.25
+    path = tmp_path / "c.hdr"
+    write_render(RenderBuffers(Buffer(radiance)), SceneOutputs(ldr=None, hdr=path), "gamma")
+    np.testing.assert_array_equal(read_image(path), np.maximum(radiance, 0))
+    assert "holds no negative radiance" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -917,12 +946,7 @@ def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkey
 
 
 def test_options_may_stand_between_scenes(tmp_path, renders):
-    scenes = [
-        write_scene(
-            tmp_path / f"{name}.json", output_file=f"{name}.png", hdr_output_file="", output_buffers=[]
-        )
-        for name in ("one", "two")
-    ]
+    scenes = write_frames(tmp_path, "one", "two")
     assert tungsten.main([str(scenes[0]), "-t", "1", str(scenes[1])]) == 0
     assert (tmp_path / "two.png").exists()
 

@@ -534,8 +534,9 @@ def test_features_of_a_later_render_are_not_mixed_with_the_picture_of_an_earlier
     read_buffers(path)
     save(tmp_path / "c001.exr", *"RGB")
     refused(path, "expected one picture beside its buffers, found c001.exr, too; .* alone, as c.exr")
-    path.write_text(json.dumps({"renderer": {**renderer, "overwrite_output_files": True}}))
-    read_buffers(path)
+    for other in ({"overwrite_output_files": True}, {"output_buffers": []}):
+        path.write_text(json.dumps({"renderer": {**renderer, **other}}))
+        read_buffers(path)
 
 
 def test_a_scene_may_hold_comments_and_trailing_commas(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_where_the_noisy_halves_tell_nothing_the_bias_is_between_variance_and_sp
 
 
 def test_pilots_that_blur_prove_no_bias_that_the_halves_deny() -> None:
-    """The true error is 0: no more than some standard errors of what the halves tell may be claimed."""
+    """The true error is next to nothing: no more than some standard errors of the halves' may be claimed."""
     sigma = 0.1
     pilots = [_noisy(sigma, seed=1), *(_constant(TRUTH + 0.5) for _ in range(3))]
     fused = _constant(TRUTH + 0.001)[0], _constant(TRUTH - 0.001)[0]

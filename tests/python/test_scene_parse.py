@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 from pathlib import Path
 
 import numpy as np
@@ -542,8 +541,8 @@ def test_names_in_other_encodings_still_name(tmp_path):
     assert load_scene(path).primitives[0].bsdf.kind == "mirror"
 
 
-def test_files_in_other_encodings_are_found(tmp_path):
-    mesh = tmp_path / os.fsdecode(b"Fu\xdfboden.obj")
+def test_files_that_a_scene_in_latin_1_names_are_found_under_names_in_utf_8(tmp_path):
+    mesh = tmp_path / "Fu\xdfboden.obj"
     mesh.touch()
     scene = {"primitives": [{"type": "mesh", "file": "Fu\xdfboden.obj"}]}
     path = tmp_path / "scene.json"

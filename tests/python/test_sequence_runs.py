@@ -133,13 +133,9 @@ def test_a_frame_is_done_again_where_anything_that_made_it_has_changed(frames, m
 
 def test_a_frame_is_done_again_where_its_input_is_that_of_another_take(frames):
     shutil.copytree("noisy", "other")  # times as well
-    Path("link").symlink_to("noisy")
-    known, same, other = (
-        find_frames(f"{take}/f####", "out/f####.exr", (0,))[0] for take in ("noisy", "link", "other")
-    )
+    known, other = (find_frames(f"{take}/f####", "out/f####.exr", (0,))[0] for take in ("noisy", "other"))
     work.denoise_frames([known], RUN)
     assert work.finished(known, RUN) is not None
-    assert work.finished(same, RUN) is not None
     assert work.finished(other, RUN) is None
 
 
@@ -393,7 +389,7 @@ def test_local_workers_that_do_not_start_are_one_line(frames, capsys, monkeypatc
     monkeypatch.setattr(distributed, "LocalCluster", local_cluster)
     assert main(arguments("--workers", "2")) == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "--workers 2: they do not start (Nanny failed to start.); use fewer, or allow more open" in last
+    assert "--workers 2: they do not start (Nanny failed to start.); use fewer, or allow more" in last
 
 
 def test_a_scheduler_without_workers_is_one_line(frames, capsys, monkeypatch):

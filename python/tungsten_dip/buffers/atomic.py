@@ -50,34 +50,34 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
 
     Raises InputError if the suffix is none of ``suffixes``, or if no file can be created there.
     """
-    if path.suffix.lower() not in suffixes:
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
     try:
         if path.is_dir():
             raise InputError(f"{path}: expected the name of a file, this is a folder")
-        temporary = _temporary(_resolved(path))
+        target = _resolved(path)
+        if suffix in _BY_OPENIMAGEIO and not is_utf8(target.parent):
+            raise InputError(f"{path}: expected a folder with a name in UTF-8 for {suffix}; choose another")
+        temporary = _temporary(target)
         temporary.open("xb").close()
         temporary.unlink(missing_ok=True)  # as another process may have done, which took its writer for dead
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); {_REMEDY}") from error
 
 
+def is_utf8(path: Path) -> bool:
+    """Return whether a path is UTF-8; Python keeps other bytes as lone surrogates."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))
+
+
 def _resolved(path: Path) -> Path:
     try:
-        target = path.resolve()
+        return path.resolve()
     except RuntimeError as error:  # as Python 3.11 and 3.12 have it
         raise InputError(f"{path}: cannot be written (a loop of links); {_REMEDY}") from error
     except ValueError as error:
         raise InputError(f"{path}: expected a name that a file can have ({error}); rename it") from error
-    if target.suffix.lower() in _IN_FOLDERS_IN_UTF8:
-        try:
-            str(target.parent).encode()
-        except UnicodeEncodeError:
-            raise InputError(
-                f"{path}: expected a folder with a name in UTF-8 for {target.suffix}; rename it, or choose "
-                f"another"
-            ) from None
-    return target
 
 
 def _temporary(target: Path) -> Path:
@@ -124,8 +124,8 @@ def _remove_left_by_the_dead(target: Path) -> None:
                     path.unlink()
 
 
-_IN_FOLDERS_IN_UTF8 = (".png", ".pfm", ".hdr")
-"""What OpenImageIO writes, which takes no other paths. The names of temporary files are always UTF-8."""
+_BY_OPENIMAGEIO = (".png", ".pfm", ".hdr")
+"""It takes paths in UTF-8 alone. The names of temporary files are always UTF-8, whatever the target's."""
 
 _TOKEN_BYTES = 4
 _MOST_OF_STEM_BYTES = 100

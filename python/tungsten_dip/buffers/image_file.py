@@ -19,7 +19,7 @@ import numpy.typing as npt
 import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
-from tungsten_dip.buffers.atomic import replacing
+from tungsten_dip.buffers.atomic import is_utf8, replacing
 from tungsten_dip.buffers.model import FloatArray, Quantity, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
@@ -197,6 +197,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")
     spec["pnm:pfmflip"] = 1
     with replacing(path) as temporary:
+        checked_name(temporary.parent)
         name = str(temporary)
         output = oiio.ImageOutput.create(name)
         pixels = np.ascontiguousarray(image, dtype=np.float32)
@@ -216,10 +217,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
 
 def checked_name(path: Path) -> str:
     """Return the path as OpenImageIO takes it. Raises InputError if the name is no UTF-8."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        raise InputError(f"{path}: expected a name in UTF-8; rename it") from None
+    if not is_utf8(path):
+        raise InputError(f"{path}: expected a name in UTF-8; rename it")
     return str(path)
 
 

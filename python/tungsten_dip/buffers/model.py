@@ -36,7 +36,8 @@ CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 
 FEATURES: tuple[Quantity, ...] = ("albedo", "normal", "depth")
 """The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
 
-MOST_SPP = 2**31
+MOST_SPP = 2**31 - 1
+"""Renderers count in 32 bits."""
 
 _AS_ARRAY = "use numpy.asarray(image, numpy.float32)"
 
@@ -107,8 +108,8 @@ class RenderBuffers:
         if self.alpha is not None:
             check_array("alpha", self.alpha)
         if isinstance(self.spp, Real):
-            if not 0 < self.spp < MOST_SPP:
-                raise InputError(f"spp: expected a number above 0 and below {MOST_SPP}, got {self.spp!r:.40}")
+            if not 0 < self.spp <= MOST_SPP:
+                raise InputError(f"spp: expected a number above 0, {MOST_SPP} at most, got {self.spp!r:.40}")
             object.__setattr__(self, "spp", float(self.spp))  # numpy's numbers are no attributes of files
         elif self.spp is not None:
             check_array("spp", self.spp, "use a number, or an array where it varies")

@@ -169,9 +169,10 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
                 quantity + suffix: file.with_name(file.stem + suffix + file.suffix) for suffix in wanted
             }
         if "color" not in files and renderer.get("hdr_output_file"):
-            picture = files["color"] = with_known_suffix(folder / renderer["hdr_output_file"])
-            if not renderer.get("overwrite_output_files", True):
+            picture = with_known_suffix(folder / renderer["hdr_output_file"])
+            if files and not renderer.get("overwrite_output_files", True):
                 later = picture.with_name(f"{picture.stem}001{picture.suffix}")
+            files["color"] = picture
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected renderer.output_buffers such as "
@@ -313,7 +314,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         if planes[key] is stacked:
             _share(stacked, [owner[name] for name in names])
     spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
-    spp = float(spp) if isinstance(spp, (int, float)) and 0 < spp < MOST_SPP else None
+    spp = float(spp) if isinstance(spp, (int, float)) and 0 < spp <= MOST_SPP else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
     buffers: dict[str, Any] = {"spp": planes.get("spp", spp)}

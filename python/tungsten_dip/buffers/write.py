@@ -194,8 +194,8 @@ def _of_result(name: str, image: FloatImage, buffers: RenderBuffers, channels: i
     expected = (buffers.height, buffers.width, channels)
     if image.shape != expected:
         raise InputError(
-            f"the {name} of the result has shape {image.shape}, that of the buffers {expected}; give those "
-            f"that it was made from"
+            f"result {name}: expected shape {expected} as the buffers have it, got {image.shape}; give the "
+            f"buffers that it was made from"
         )
     return image.astype(np.float32, copy=False)
 

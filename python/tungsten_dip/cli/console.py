@@ -59,7 +59,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; see '{self.prog} --help'")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Print the help or the version; argparse says nothing if that fails."""
+        """Print the help or the version. Raises InputError if that fails, of which argparse says nothing."""
         with writing_stdout():
             print(message, end="", file=file, flush=True)
 

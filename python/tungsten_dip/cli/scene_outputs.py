@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
@@ -47,6 +49,10 @@ class SceneOutputs:
         names = ("_denoised.exr", "_denoised.png", "_side_by_side.png")
         exr, png, pair = (self.beside(name) for name in names)
         return exr, png, pair
+
+    def preview(self) -> Path:
+        """Return the path of the picture that is denoised before the render is done."""
+        return self.beside("_preview.png")
 
     def numbered(self, denoise: bool) -> SceneOutputs:
         """Return the outputs with the first number (none, 001, 002, ...) under which no picture exists.
@@ -98,14 +104,14 @@ def scene_outputs(
     def placed(own: Path | None, name: str) -> Path | None:
         return own_folder / own if own else folder / name if name else None
 
-    def absolute(name: str, suffixes: tuple[str, ...]) -> str:
+    def in_folder(name: str, suffixes: tuple[str, ...]) -> str:
         return str(folder / _known(name, suffixes)) if name else ""
 
     buffers = tuple(
         replace(
             buffer,
-            ldr_output_file=absolute(buffer.ldr_output_file, _LDR),
-            hdr_output_file=absolute(buffer.hdr_output_file, radiance_suffixes(buffer.type)),
+            ldr_output_file=in_folder(buffer.ldr_output_file, _LDR),
+            hdr_output_file=in_folder(buffer.hdr_output_file, radiance_suffixes(buffer.type)),
         )
         for buffer in renderer.output_buffers
     )
@@ -127,12 +133,12 @@ def _known(name: str, suffixes: tuple[str, ...]) -> str:
         raise InputError(
             f"{name}: expected the name of a file such as picture{suffixes[0]}; correct the scene"
         )
-    written = str(with_known_suffix(Path(name), suffixes))
-    if written != str(Path(name)):
+    written = with_known_suffix(Path(name), suffixes)
+    if written != Path(name):
         _LOG.warning(
             "%s: expected a name that ends in %s; written as %s", name, " or ".join(suffixes), written
         )
-    return written
+    return str(written)
 
 
 def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: TonemapName) -> None:
@@ -142,7 +148,11 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: Tonemap
     render left it: it would pass for this one's.
     """
     if outputs.hdr is not None:
-        write_image(outputs.hdr, buffers.color.mean)
+        radiance = buffers.color.mean
+        if outputs.hdr.suffix.lower() == ".hdr" and (radiance < 0).any():
+            _LOG.warning("%s: holds no negative radiance, which is 0 there; .exr does", outputs.hdr)
+            radiance = np.maximum(radiance, 0)
+        write_image(outputs.hdr, radiance)
     if outputs.ldr is not None:
         write_image(outputs.ldr, display_from_radiance(buffers.color.mean, tonemap))
     outdated = []

@@ -195,7 +195,7 @@ def _render_scene(
     Raises InputError if the scene would write over one of those, or as whatever is called here does.
     """
     scene = load_scene(path, options.input_directory)
-    outputs = _checked_outputs(scene, path, options, written)
+    outputs, files = _checked_outputs(scene, path, options, written)
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
@@ -203,6 +203,7 @@ def _render_scene(
             else:
                 buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
         write_render(buffers, unwritten, scene.camera.tonemap)
+        written |= files
         for picture in filter(None, (outputs.ldr, outputs.hdr)):
             _LOG.info("wrote %s", picture)
         if denoise is not None:
@@ -213,8 +214,11 @@ def _render_scene(
 
 def _checked_outputs(
     scene: Scene, path: Path, options: argparse.Namespace, written: set[Path]
-) -> SceneOutputs:
-    """Return what a scene writes: it can be written, over no input and over no file of the scenes before."""
+) -> tuple[SceneOutputs, set[Path]]:
+    """Return what a scene writes, and all its files, with what is made of the render.
+
+    They can be written, over no input and over no file of the scenes before.
+    """
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
@@ -229,7 +233,9 @@ def _checked_outputs(
     if not scene.renderer.overwrite_output_files:
         outputs = outputs.numbered(options.dip_denoise)
     outputs.check()
-    own = outputs.denoised() if options.dip_denoise else ()
+    own = list(outputs.denoised()) if options.dip_denoise else []
+    if options.dip_preview:
+        own.append(outputs.preview())
     for file in own:
         check_writable(file, (file.suffix,))
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
@@ -243,12 +249,11 @@ def _checked_outputs(
             f"{path}: would write over {min(overwritten)}, which belongs to a scene before; give every scene "
             f"file names of its own"
         )
-    written |= rendered | derived
     if options.report is not None:
         check_writable(options.report, (".html",))
     if options.save_model is not None:
         check_writable(options.save_model, (".onnx",))
-    return outputs
+    return outputs, rendered | derived
 
 
 def _render_with_tungsten(
@@ -297,8 +302,7 @@ def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoi
 
 def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten_host.Rendered], None]:
     """Return what writes a quickly denoised picture of a render that goes on."""
-    path = outputs.beside("_preview.png")
-    check_writable(path, (path.suffix,))
+    path = outputs.preview()
     draft = FitSettings(preset="draft", device=settings.device, threads=settings.threads)
 
     def write(rendered: tungsten_host.Rendered) -> None:

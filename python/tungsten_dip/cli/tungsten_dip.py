@@ -198,8 +198,8 @@ def _denoised(
         result = denoise(buffers)
     write_denoised(options.output, result, buffers, float16=options.float16)
     if options.report is not None:
-        # The path "." has no name of its own.
-        name = options.input.absolute().name
+        named = options.input.name not in ("", "..")  # a link has a name of its own
+        name = (options.input if named else options.input.resolve()).name
         write_report(options.report, name, buffers, result, DEFAULT_TONEMAP, remarks)
     if options.error_map is not None:
         assert result.error is not None

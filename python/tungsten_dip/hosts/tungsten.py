@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
@@ -53,7 +53,7 @@ class DriverOptions:
     hdr_output_file: Path | None = None
 
     def __post_init__(self) -> None:
-        for name, least, most in (("threads", 1, 2**31 - 1), ("spp", 1, 2**31 - 1), ("seed", 0, 2**32 - 1)):
+        for name, least, most in (("threads", 1, 2**31 - 1), ("spp", 1, MOST_SPP), ("seed", 0, 2**32 - 1)):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, whole_number(name, value, least, most))

@@ -146,9 +146,10 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
                     )
                     client = stack.enter_context(Client(stack.enter_context(cluster)))
             except (OSError, RuntimeError) as error:
+                reason = " ".join(str(error).split())
                 raise InputError(
-                    f"--workers {workers}: they do not start ({error}); use fewer, or allow more open files "
-                    f"(ulimit -n)"
+                    f"--workers {workers}: they do not start ({reason:.200}); use fewer, or allow more "
+                    f"memory and open files (ulimit -n)"
                 ) from error
             yield client
         return

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, FloatImage, Quantity, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import check_fits_mitsuba
@@ -99,8 +99,8 @@ def render_translated(
     With ``timeout_s`` the picture is rendered in passes of ``spp_step``, and no pass begins after that time;
     at least one is rendered, and the buffers tell the spp that were reached.
     """
-    spp = whole_number("spp", spp, 1, 2**31 - 1)
-    spp_step = whole_number("spp_step", spp_step, 1, 2**31 - 1)
+    spp = whole_number("spp", spp, 1, MOST_SPP)
+    spp_step = whole_number("spp_step", spp_step, 1, MOST_SPP)
     threads = None if threads is None else whole_number("threads", threads, 1, 2**31 - 1)
     seed = whole_number("seed", seed, 0, 2**32 - 1)
     started = time.perf_counter()
