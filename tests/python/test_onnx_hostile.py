@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -227,11 +228,12 @@ def test_files_that_are_no_models(tmp_path: Path, saved: Path) -> None:
         with pytest.raises(InputError) as raised:
             load_model(path)
         assert str(path) in str(raised.value)
-    for name in ("none", "a\0none", "\ud800none"):
+    for name in ("none", "a\0none", "\ud800none", 300 * "a" + "none"):
         with pytest.raises(InputError, match=r"none\.onnx: cannot be read"):
             load_model(tmp_path / f"{name}.onnx")
-    with pytest.raises(InputError, match="expected a file"):
-        load_model(tmp_path)
+    for path in (tmp_path, Path(os.devnull)):
+        with pytest.raises(InputError, match="expected a file, found a folder or device"):
+            load_model(path)
 
 
 @pytest.mark.parametrize("name", [b"layer1.weight", b"tungsten_dip", b"Conv", b"inputs"])

@@ -130,7 +130,7 @@ def fit_fusion(
 def _preset(settings: FitSettings, following: bool) -> _Preset:
     preset = _PRESETS[settings.preset]
     if preset.members > 1 and (following or settings.time_budget_s is not None):
-        # What time there is is better spent on the steps of one network.
+        # A time budget, or the little time of a frame, is better spent on the steps of one network.
         preset = replace(preset, members=1, steps=_STEPS_OF_ONE)
     if following:
         # The previous frame moved into place has no counterpart among the pilots of all samples.

@@ -73,13 +73,14 @@ def load_model(path: str | Path) -> Model:
     Raises InputError if the file is anything else.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: expected a file, found a folder or device")
     try:
+        # A device may have no end.
+        if path.exists() and not path.is_file():
+            raise OSError("expected a file, found a folder or device")
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE_BYTES + 1)
     except (OSError, ValueError) as error:  # such as a NUL in the name
-        reason = getattr(error, "strerror", error)
+        reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read ({reason}); check the path") from error
     try:
         return _model_from_bytes(content)
