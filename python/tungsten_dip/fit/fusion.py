@@ -18,9 +18,9 @@ import numpy as np
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.denoised import result_from_fused, result_without_noise
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.model import Model, source_sha256
-from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,

@@ -11,9 +11,9 @@ import numpy as np
 from tungsten_dip.buffers.model import FloatArray
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.error import estimate_error, held_out_error
 from tungsten_dip.fit.evidence import Evidence, Indices, with_best_reference
 from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.outcome import estimate_error, held_out_error
 from tungsten_dip.fit.planes import (
     LARGEST_INPUT,
     Standardisation,

@@ -13,10 +13,10 @@ from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.denoised import result_from_fused, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.fusion import blends_all_samples
 from tungsten_dip.fit.model import Model, check_finite, check_planes
-from tungsten_dip.fit.outcome import result_from_fused, result_without_noise
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.published.images import network_input, paper_images

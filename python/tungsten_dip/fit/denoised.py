@@ -1,0 +1,104 @@
+"""Makes the result from a network's output: the image, its error, and whether it is better than the input."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+from tungsten_dip.cores import thread_count
+from tungsten_dip.fit.all_samples import with_all_samples
+from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.error import epsilon_of_renderer, error_from_halves, estimate_error, relative_error
+from tungsten_dip.fit.evidence import Evidence
+from tungsten_dip.fit.exposure import exposure, unscaled
+from tungsten_dip.fit.lost_detail import with_lost_detail
+from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.settings import FitSettings
+
+_ERROR_RADIUS = 4
+_CONVERGED = 1e-5
+"""relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
+
+
+def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: Clock) -> FitResult | None:
+    """Return the image as it is if its halves hardly differ, else None.
+
+    Copies do not differ at all: they count as free of noise only if the variance confirms it.
+    """
+    color = buffers.color
+    if color.halves is None:
+        return None
+    a, b = color.halves
+    squared = color.mean.astype(np.float64) ** 2
+    noise = (a - b).astype(np.float64) ** 2 / 4
+    # Dark images are not mistaken for clean ones.
+    bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
+    estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
+    if max(estimated) >= _CONVERGED or estimated == [0]:
+        return None
+    error = channel_mean(relative_error(noise, squared + RELMSE_EPSILON).astype(np.float32))
+    return FitResult(
+        color=color.mean.copy(),
+        settings=settings,
+        seconds=clock.seconds(),
+        iterations=0,
+        error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
+        estimated_relmse=float(error.mean(dtype=np.float64)),
+        halves=color.halves,
+        notes=("the halves agree to within a few thousandths: the image is returned as it is",),
+    )
+
+
+def result_from_fused(
+    evidence: Evidence,
+    fused: Halves,
+    whole: FloatImage | None,
+    settings: FitSettings,
+    clock: Clock,
+    iterations: int,
+    history: Sequence[HistoryPoint],
+    notes: Sequence[str],
+) -> FitResult:
+    """Make the result from the network's outputs for both halves, or from the input if that is as good.
+
+    ``whole`` are the pilots of all samples, blended with the mean of both halves' weights.
+    """
+    threads = evidence.threads
+    shape = fused[0].shape
+    fused = with_lost_detail(evidence.halves, fused)
+    fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
+    image = np.float32(0.5) * (fused[0] + fused[1])
+    if whole is not None:
+        image = with_all_samples(fused, whole, threads)
+    error = estimate_error(evidence.pilots, evidence.scale, fused_a, fused_b).reshape(*shape[:2], 1)
+
+    # The error of the plain mean, by the same evidence.
+    half_a, half_b = evidence.halves
+    squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
+    error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
+    notes = [*evidence.notes, *notes]
+    estimated, _ = error_from_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
+    if estimated >= error_of_input:
+        notes.append("the input is as good as anything fitted to it, and is returned")
+        image, fused = evidence.mean, evidence.halves
+        epsilon = epsilon_of_renderer(evidence.scale)
+        error = relative_error(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
+    if evidence.gain is not None:
+        image = image * evidence.gain
+    return FitResult(
+        color=unscaled(image, evidence.scale),
+        settings=settings,
+        seconds=clock.seconds(),
+        iterations=iterations,
+        error=_core.box_mean(error, _ERROR_RADIUS, threads),
+        estimated_relmse=float(error.mean(dtype=np.float64)),
+        halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
+        gain=evidence.gain,
+        history=tuple(history),
+        notes=tuple(notes),
+    )

@@ -1,0 +1,110 @@
+"""Estimates the error of a network's output without a reference, from its halves and pilots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import FloatArray, Halves
+from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+
+_CHUNK_PIXELS = 1 << 18
+_BIAS = 2.4
+"""What the squared bias is, about, to the geometric mean of the variance and the median squared difference of
+the pilots from the result."""
+
+_CONFIDENCE = 4.0
+"""An estimate may lie so many standard errors above the error estimated from the halves."""
+
+_SURE = 0.35
+"""Relative standard error of an estimated relMSE up to which it is used."""
+
+_LARGEST_ERROR = 1e30
+"""Larger relative squared errors count as this large: their sums overflow."""
+
+
+def estimate_error(
+    pilots: Sequence[Halves], scale: float, fused_a: FloatArray, fused_b: FloatArray
+) -> FloatArray:
+    """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
+
+    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs for one half each, shape
+    (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
+    (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
+    they differ from f where there is something to blur; but some are far off where the network rightly
+    avoids them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric
+    mean of the variance and the median squared difference of f and the pilots, or less if the noisy halves
+    imply a smaller mean error (see `error_from_halves`).
+    """
+    output = np.float32(0.5) * (fused_a + fused_b)
+    epsilon = epsilon_of_renderer(scale)
+    squared = (fused_a - fused_b) ** 2 / 4
+    variance = np.empty(len(output), np.float32)
+    bias = np.empty(len(output), np.float32)
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
+    for first in range(0, len(output), _CHUNK_PIXELS):
+        part = slice(first, first + _CHUNK_PIXELS)
+        relative = 1 / (output[part] ** 2 + epsilon)
+        with np.errstate(over="ignore"):
+            apart = [
+                channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
+                for a, b in computed
+            ]
+            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
+            apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
+        # The root of each: their product would overflow.
+        bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
+    estimated, standard_error = error_from_halves(pilots[0], fused_a, fused_b, epsilon)
+    least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
+    allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
+    return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
+
+
+def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: FloatArray) -> float:
+    """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
+
+    Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
+    exposure. Estimated from the noisy halves or, where their standard error is too large, from the smallest
+    pilot, far less noisy but a little blurred.
+    """
+    epsilon = np.float32(RELMSE_EPSILON)
+    for targets in pilots[:2]:
+        mean, standard_error = error_from_halves(targets, fused_a, fused_b, epsilon)
+        if standard_error < _SURE * mean:
+            break
+    relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
+    return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
+
+
+def error_from_halves(
+    targets: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
+) -> tuple[float, float]:
+    """Return the mean error estimated from independent targets, and its standard error.
+
+    With targets a, b (noisy images of the truth) and outputs f_a, f_b for one half each, E (f_a - b)^2 is the
+    error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of
+    one output; the mean of two has half of that.
+    """
+    a, b = (image.reshape(-1, 3) for image in targets)
+    crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
+    error = channel_mean(relative_error(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
+    spread = float(error.std(dtype=np.float64))
+    return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
+
+
+def relative_error(
+    squared: npt.NDArray[np.floating[Any]], denominator: npt.NDArray[np.floating[Any]]
+) -> npt.NDArray[Any]:
+    """Return squared errors relative to a denominator, bounded so that they can be summed."""
+    with np.errstate(over="ignore"):
+        return np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
+
+
+def epsilon_of_renderer(scale: float) -> np.float32:
+    """0.01 in the renderer's units, squared differences of which are scaled twice; bounded for float32."""
+    return np.float32(min(max(RELMSE_EPSILON * scale**2, 1e-30), 1e30))
