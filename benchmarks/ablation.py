@@ -18,12 +18,13 @@ from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.report.metrics import compare
 
 Change = Callable[[], AbstractContextManager[object]]
 
 
-def _without(unwanted: Callable[[pilots.Pilot], bool]) -> Change:
+def _without(unwanted: Callable[[Pilot], bool]) -> Change:
     preset = fusion._PRESETS["balanced"]
     kept = tuple(pilot for pilot in preset.pilots if not unwanted(pilot))
     return lambda: mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=kept))
@@ -31,9 +32,7 @@ def _without(unwanted: Callable[[pilots.Pilot], bool]) -> Change:
 
 def _with_one_pilot() -> AbstractContextManager[object]:
     preset = fusion._PRESETS["balanced"]
-    return mock.patch.dict(
-        fusion._PRESETS, balanced=replace(preset, pilots=(pilots.Pilot(10, k=1.0, step=2),))
-    )
+    return mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=(Pilot(10, k=1.0, step=2),)))
 
 
 VARIANTS: dict[str, Change] = {

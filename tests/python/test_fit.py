@@ -19,11 +19,11 @@ from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
     Guidance,
-    Pilot,
     PilotMaker,
     first_guides,
     guidance_of_halves,

@@ -16,11 +16,10 @@ from fitted_models import DRAFT, paper_model, session_of
 from tungsten_dip.buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.evidence import Layout
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pilots import Pilot
-from tungsten_dip.fit.planes import Standardisation
 from tungsten_dip.fit.pointwise import Examples, first_weights
+from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import infer, inference
 from tungsten_dip.onnx.file import proto_from_model
 

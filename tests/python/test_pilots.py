@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     Guidance,
-    Pilot,
     PilotMaker,
     divisor,
     first_guides,

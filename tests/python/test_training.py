@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender, SyntheticRender
+from tungsten_dip.buffers.model import Indices
 from tungsten_dip.fit import FitSettings, denoise, fusion, training
-from tungsten_dip.fit.evidence import Evidence, Indices
+from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.pointwise import HIDDEN, Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import LEARNING_RATE

@@ -12,9 +12,8 @@ import pytest
 from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.evidence import Layout
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pilots import Pilot
 from tungsten_dip.fit.planes import PLANES_RADIUS, network_inputs, planes_of_half
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights, training_step, weight_shapes
 from tungsten_dip.fit.training import start_of_training

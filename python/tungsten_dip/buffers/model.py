@@ -28,6 +28,9 @@ Halves = tuple[FloatImage, FloatImage]
 FloatArray = npt.NDArray[np.float32]
 """Of any shape that is not an image's."""
 
+Indices = npt.NDArray[np.int64]
+"""Of pixels, counted row by row."""
+
 Quantity = Literal["color", "albedo", "normal", "depth", "visibility"]
 
 CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}

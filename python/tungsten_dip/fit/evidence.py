@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from threading import Event
 
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Indices, RenderBuffers
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.fireflies import Limited, limit_fireflies
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.neighbours import mean_around
 from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
@@ -25,7 +25,6 @@ from tungsten_dip.fit.pilots import (
     FOLLOWING_PILOTS,
     Guidance,
     Guides,
-    Pilot,
     PilotMaker,
     alpha_as_albedo,
     first_guides,
@@ -36,9 +35,6 @@ from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.progress import Progress
 
-Indices = npt.NDArray[np.int64]
-
-SCORE_RADII = (2, 4, 8, 16)
 _NOISE_RADIUS = 8
 _NEAR_RADIUS = 2
 """Of the windows that must be empty for a pixel to be empty space."""
@@ -49,41 +45,6 @@ OUTLIER = 20.0
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
 """Of a time budget, after which no further pilot, or none of draft's, begins; the rest is the training's."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The inputs of a network and the images it chooses among: the same for every image that it is used on.
-
-    ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
-    filters compute, then so many ``candidates``: the caller's, Open Image Denoise's, the previous frame.
-    ``reference`` is the index of the pilot that the others are compared with.
-    """
-
-    features: tuple[str, ...]
-    pilots: tuple[Pilot, ...]
-    candidates: int
-    reference: int
-
-    @property
-    def choices(self) -> int:
-        """How many images the network chooses among."""
-        return 1 + len(self.pilots) + self.candidates
-
-    @property
-    def planes(self) -> tuple[str, ...]:
-        """The names of what `planes_of_half` yields, in its order."""
-        return (
-            *self.features,
-            "noise",
-            "level",
-            *(
-                f"pilot {index} {what}"
-                for index in range(self.choices)
-                if index != self.reference
-                for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
-            ),
-        )
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import result_from_fused, result_without_noise
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model, source_sha256
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -27,7 +28,6 @@ from tungsten_dip.fit.pilots import (
     FINAL_PILOTS,
     FOLLOWING_DRAFT_PILOTS,
     FOLLOWING_PILOTS,
-    Pilot,
 )
 from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.result import FitResult

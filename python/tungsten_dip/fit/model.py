@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.model import FloatArray, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.evidence import Layout
-from tungsten_dip.fit.planes import Standardisation
+from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings
+from tungsten_dip.fit.standardisation import Standardisation
 
 Kind = Literal["pointwise", "skip", "resnet"]
 

@@ -18,6 +18,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import Buffer, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_features
+from tungsten_dip.fit.layout import Pilot
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
@@ -57,25 +58,6 @@ _STRAY_RADIUS = 2
 _SAMPLES_OF_GUIDE = 12
 """About how many independent pixels a guide of all samples averages: no second half is left to estimate its
 noise, which is taken to be that of the image divided by this."""
-
-
-@dataclass(frozen=True)
-class Pilot:
-    """One window of regression, ``radius`` and ``step`` in pixels.
-
-    ``k`` is the damping of non-local means by a guide; None: neighbours are weighted by features alone.
-    ``with_position``: the pixel's position is a further feature. ``along_edges``: no regression, but the mean
-    along the edges of the features, with the standard deviation ``radius``. It estimates how much of a pixel
-    each surface covers better than the samples in the pixel do. ``by_color``: without features and albedo,
-    which on mirrors, in glass and out of focus are as noisy as the colour.
-    """
-
-    radius: int
-    k: float | None = None
-    step: int = 1
-    with_position: bool = False
-    along_edges: bool = False
-    by_color: bool = False
 
 
 FIRST_GUIDE = Pilot(radius=3)

@@ -9,26 +9,22 @@ that noise, which is why the network's input is one pixel.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import (
     OUTLIER,
-    SCORE_RADII,
     Evidence,
     denominators_of,
     squared_error,
 )
+from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around
 
 PLANES_RADIUS = max(SCORE_RADII)
-LARGEST_INPUT = 4.0
 
 # What the planes are made with is part of every saved network (`onnx.file` numbers the format): errors are
 # relative to the squared radiance, brightness is in units of the evidence.
@@ -50,8 +46,6 @@ _SCORE_UNIT = 0.05
 _LARGEST_SCORE = 3.0
 """... and this is the worst score."""
 
-_LEAST_SPREAD = 1e-6
-_PART_PIXELS = 1 << 11
 _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
@@ -116,50 +110,6 @@ def network_inputs(evidence: Evidence) -> FloatArray:
 
     in_pair(fill, evidence.threads)
     return inputs
-
-
-@dataclass(frozen=True)
-class Standardisation:
-    """Brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
-
-    mean: npt.NDArray[np.float64]
-    std: FloatArray
-
-    def apply(self, inputs: FloatArray, threads: int) -> None:
-        """Standardise planes in place, shape (2, pixels, planes), clipped to 4 standard deviations."""
-
-        def standardise(half: int) -> None:
-            for part in _parts(inputs[half]):
-                np.clip(
-                    (part - self.mean) / self.std,
-                    -LARGEST_INPUT,
-                    LARGEST_INPUT,
-                    out=part,
-                    casting="same_kind",
-                )
-
-        in_pair(standardise, threads)
-
-
-def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
-    """Return mean and standard deviation of every plane of shape (2, pixels, planes)."""
-    count = inputs.shape[0] * inputs.shape[1]
-
-    def sums(half: int) -> Any:
-        return sum(part.sum(axis=0, dtype=np.float64) for part in _parts(inputs[half]))
-
-    def squares(half: int) -> Any:
-        return sum(((part - mean) ** 2).sum(axis=0) for part in _parts(inputs[half]))
-
-    mean = sum(in_pair(sums, threads)) / count
-    variance = sum(in_pair(squares, threads)) / count
-    return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
-
-
-def _parts(planes: FloatArray) -> Iterator[FloatArray]:
-    """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
-    for first in range(0, len(planes), _PART_PIXELS):
-        yield planes[first : first + _PART_PIXELS]
 
 
 def _log_level(image: FloatImage) -> FloatImage:

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import onnx
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Indices
 from tungsten_dip.cores import in_parallel
-from tungsten_dip.fit.evidence import Indices, Layout
+from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.model import Weights, check_finite
 from tungsten_dip.graphs.builder import GraphBuilder
 from tungsten_dip.graphs.sessions import Device, session_from_proto

@@ -8,22 +8,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.buffers.model import FloatArray, Indices
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error
-from tungsten_dip.fit.evidence import Evidence, Indices, with_best_reference
+from tungsten_dip.fit.evidence import Evidence, with_best_reference
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.planes import (
-    LARGEST_INPUT,
-    Standardisation,
     loss_weights,
     network_inputs,
-    standardisation_of,
 )
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.standardisation import LARGEST_INPUT, Standardisation, standardisation_of
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2

@@ -15,7 +15,6 @@ from onnx import TensorProto
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.planes import LARGEST_INPUT
 from tungsten_dip.fit.pointwise import HIDDEN, members_of
 from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
 from tungsten_dip.fit.published.constants import (
@@ -26,6 +25,7 @@ from tungsten_dip.fit.published.constants import (
     SIDE_CHANNELS,
     SIDE_SCALES,
 )
+from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
 _MOST_MEMBERS = 16
