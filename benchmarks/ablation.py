@@ -17,7 +17,7 @@ from unittest import mock
 from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, pilots
+from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, surfaces
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.report.metrics import compare
 
@@ -51,7 +51,7 @@ VARIANTS: dict[str, Change] = {
     "no pilot that sees only the colour": _without(lambda pilot: pilot.by_color),
     "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 1, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
-        pilots, "_smooth_emission", lambda emission, filtered, *_: filtered
+        surfaces, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
     "no pilots of all samples": lambda: mock.patch.object(fusion, "pilots_of_all_samples", return_value=()),
     "empty space like any other": lambda: mock.patch.object(evidence, "_occupied", return_value=1),

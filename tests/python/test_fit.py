@@ -23,13 +23,12 @@ from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
-    Guidance,
     PilotMaker,
     first_guides,
-    guidance_of_halves,
 )
 from tungsten_dip.fit.pointwise import Examples
 from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.surfaces import Guidance, guidance_of_halves
 from tungsten_dip.fit.training import Training, _batches
 
 

@@ -10,12 +10,10 @@ import pytest
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
-    Guidance,
     PilotMaker,
-    divisor,
     first_guides,
-    guidance_of_halves,
 )
+from tungsten_dip.fit.surfaces import Guidance, divisor, guidance_of_halves
 
 Plane = np.ndarray
 

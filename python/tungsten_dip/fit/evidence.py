@@ -23,16 +23,14 @@ from tungsten_dip.fit.oidn import oidn_image
 from tungsten_dip.fit.pilots import (
     DRAFT_PILOTS,
     FOLLOWING_PILOTS,
-    Guidance,
     Guides,
     PilotMaker,
-    alpha_as_albedo,
     first_guides,
     following_guides,
-    guidance_of_halves,
 )
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
+from tungsten_dip.fit.surfaces import Guidance, alpha_as_albedo, guidance_of_halves
 from tungsten_dip.progress import Progress
 
 _NOISE_RADIUS = 8

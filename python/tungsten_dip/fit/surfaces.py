@@ -1,0 +1,275 @@
+"""What the features show of an image's surfaces, by which its pilots distinguish and demodulate them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.prefilter import prefilter_features
+
+# Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
+# degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
+# far away.
+_NORMAL_PENALTY = 3.0
+_ALBEDO_PENALTY = 20.0
+_DEPTH_PENALTY = 5.0
+_DEPTH_SCALE = 3.0
+
+_LEAST_ALBEDO = 0.01
+"""Added to the albedo that divides the colour, so that dark surfaces keep their noise finite."""
+
+_BLACK_ALBEDO = 1e-3
+"""Below it a surface's colour (a mirror's, say) does not come from its albedo and is not divided by it."""
+
+_BRIGHTEST_ALBEDO = 1e6
+"""The regression does not distinguish brighter emission, in the renderer's units."""
+
+EDGES_RADIUS = 6
+"""Standard deviation, in pixels, of the means along edges that smooth emission and that are a pilot."""
+
+_ACROSS_EDGES = 0.3
+"""Standard deviation, in pixels, of the mean along edges in the direction across them."""
+
+_CHANNELS = {"albedo": "RGB", "alpha": "A", "normal": "XYZ", "depth": "Z"}
+
+_STRAY = 4.0
+_STRAY_RADIUS = 2
+"""Emission of one half more than so many times the sum over the other half's 5x5 pixels was hit by chance."""
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """What all pilots of one half share: the features to regress on, and how the colour is demodulated.
+
+    ``features`` (height, width, n) are pre-filtered and scaled, with one of ``names`` and one ``penalty``
+    each. Features that are the same in every pixel are not among them; ``left_out`` maps their names to their
+    values. ``albedo`` (height, width, 3), never 0, divides the colour. ``emission`` (height, width, 3) is the
+    radiance emitted towards the half's own samples, which is subtracted before, and ``smooth_emission`` the
+    denoised one that is added back, both linear and in the units of `evidence.Evidence`. ``edges``, shape
+    (height, width, 3), is the features' structure tensor.
+    """
+
+    features: FloatImage
+    names: tuple[str, ...]
+    left_out: dict[str, float]
+    penalty: tuple[float, ...]
+    albedo: FloatImage
+    emission: FloatImage
+    smooth_emission: FloatImage
+    edges: FloatImage
+    threads: int
+
+    def irradiance(self, color: FloatImage) -> FloatImage:
+        """Return the irradiance (colour without emission, divided by albedo) of a noisy half ``color``."""
+        irradiance: FloatImage = (color - self.emission) / self.albedo
+        return irradiance
+
+    def color(self, irradiance: FloatImage) -> FloatImage:
+        """Return the radiance, never negative, of surfaces under this irradiance and of lights."""
+        color: FloatImage = np.maximum(irradiance, 0) * self.albedo + self.smooth_emission
+        return color
+
+    def without_features(self) -> Guidance:
+        """Return what pilots that see the colour alone share: its radiance is their irradiance."""
+        nothing = np.zeros_like(self.emission)
+        return replace(
+            self,
+            features=np.empty((*self.features.shape[:2], 0), np.float32),
+            names=(),
+            penalty=(),
+            albedo=np.ones_like(self.albedo),
+            emission=nothing,
+            smooth_emission=nothing,
+        )
+
+
+def guidance_of_halves(
+    buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
+) -> tuple[Guidance, ...]:
+    """Pre-filter, scale and select the features of sanitised buffers; return the guidance of every colour.
+
+    ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
+    shape (height, width, 3). The guidance of a half is computed from its own samples alone (the other half
+    only determines which of them are averaged), since errors that a half's features share with the colour
+    that scores them would be mistaken for signal. Features without halves, and alpha, which has none, are the
+    exception.
+    """
+    count = len(colors)
+    alpha = alpha_as_albedo(buffers)
+    if alpha is not None:
+        buffers = replace(buffers, albedo=Buffer(np.repeat(alpha, 3, axis=2)))
+    albedos: tuple[FloatImage, ...] = ()
+    if buffers.albedo is not None:
+        rendered = _without_stray_emission(buffers.albedo, threads)
+        albedos = _bounded_albedos(rendered, colors, scale)
+        buffers = replace(buffers, albedo=_with_planes(rendered, albedos))
+    filtered = prefilter_features(buffers, threads)
+    depth_scale = _depth_scale(filtered)
+    planes_of_colors = [
+        _feature_planes(filtered, index, count, depth_scale, of_alpha=alpha is not None)
+        for index in range(count)
+    ]
+    flat = [
+        name
+        for name in planes_of_colors[0]
+        if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_colors)
+    ]
+    surfaces: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
+    if filtered.albedo is not None:
+        surfaces = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
+    return tuple(
+        _guidance(planes, flat, surface, color.shape, scale, threads)
+        for planes, surface, color in zip(planes_of_colors, surfaces, colors, strict=True)
+    )
+
+
+def alpha_as_albedo(buffers: RenderBuffers) -> FloatImage | None:
+    """Return the alpha, 0 to 1, that takes the place of a missing albedo, shape (height, width, 1).
+
+    Premultiplied colour is that of surfaces times their coverage, as it is their irradiance times albedo.
+    """
+    if buffers.albedo is not None or buffers.alpha is None:
+        return None
+    alpha: FloatImage = np.clip(np.nan_to_num(buffers.alpha), 0, 1)
+    return alpha
+
+
+def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: float) -> tuple[FloatImage, ...]:
+    """Return the albedo for every colour, bounded by 1 plus the radiance of that colour.
+
+    Above 1 it is emitted light, which the colour must contain too. What the colour does not contain is an
+    outlier, and would be smeared over its surroundings.
+    """
+    return tuple(
+        np.minimum(plane, 1 + np.maximum(color / np.float32(scale), 0))
+        for plane, color in zip(_planes(albedo, len(colors)), colors, strict=True)
+    )
+
+
+def _with_planes(feature: Buffer, planes: tuple[FloatImage, ...]) -> Buffer:
+    """Replace the halves of a feature or, of one without halves or for one colour, the mean."""
+    if feature.halves is None or len(planes) == 1:
+        return replace(feature, mean=planes[0])
+    a, b = planes
+    return Buffer(np.float32(0.5) * (a + b), a, b, feature.variance)
+
+
+def _depth_scale(filtered: RenderBuffers) -> float:
+    """Return the median depth of the pixels that hit a surface; 1 if none did."""
+    if filtered.depth is None:
+        return 1.0
+    hit = filtered.depth.mean[filtered.depth.mean > 0]
+    return float(np.median(hit)) if hit.size else 1.0
+
+
+def _guidance(
+    planes: dict[str, tuple[FloatImage, float]],
+    flat: Sequence[str],
+    albedos: tuple[FloatImage, FloatImage] | None,
+    shape: tuple[int, ...],
+    scale: float,
+    threads: int,
+) -> Guidance:
+    """Return the guidance of one colour of this shape.
+
+    ``planes`` are those of `_feature_planes`, of which those named by ``flat`` are left out. ``albedos`` is
+    the albedo before and after pre-filtering, if there is one.
+    """
+    kept = tuple(name for name in planes if name not in flat)
+    features = np.empty((*shape[:2], len(kept)), np.float32)
+    for index, name in enumerate(kept):
+        features[:, :, index] = planes[name][0]
+    penalty = tuple(planes[name][1] for name in kept)
+    edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
+    albedo = np.ones(shape, np.float32)
+    emission = smooth_emission = np.zeros(shape, np.float32)
+    if albedos is not None:
+        noisy, smooth = albedos
+        albedo = divisor(np.clip(smooth, 0, 1))
+        emission = np.maximum(noisy - 1, 0) * np.float32(scale)
+        smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
+        if emission.any():
+            smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
+    left_out = {name: float(planes[name][0][0, 0]) for name in flat}
+    return Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
+
+
+def _smooth_emission(
+    emission: FloatImage, filtered: FloatImage, edges: FloatImage, threads: int
+) -> FloatImage:
+    # The pre-filter blurs long edges of bright lights, the mean along edges their corners.
+    smooth: FloatImage = np.float32(0.5) * (filtered + along_edges(emission, edges, EDGES_RADIUS, threads))
+    return smooth
+
+
+def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
+    """Return an albedo above 1 only where both halves saw emission, in about the same place.
+
+    A path that hit a light through glass or a mirror by chance is noise, and remains in the colour: as
+    emission it would not be denoised.
+    """
+    if albedo.halves is None or not (albedo.mean > 1).any():
+        return albedo
+    a, b = albedo.halves
+    limits = (
+        1 + np.float32(_STRAY * (2 * _STRAY_RADIUS + 1) ** 2) * around
+        for around in (_core.box_mean(np.maximum(half - 1, 0), _STRAY_RADIUS, threads) for half in (b, a))
+    )
+    kept_a, kept_b = (np.minimum(half, limit) for half, limit in zip((a, b), limits, strict=True))
+    taken = np.float32(0.5) * ((a - kept_a) + (b - kept_b))
+    return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
+
+
+def _feature_planes(
+    filtered: RenderBuffers, index: int, count: int, depth_scale: float, of_alpha: bool
+) -> dict[str, tuple[FloatImage, float]]:
+    """Return every channel of the features of one of ``count`` colours, scaled, and its penalty.
+
+    ``of_alpha``: the albedo is alpha, three times.
+    """
+    scaled: list[tuple[str, FloatImage, float]] = []
+    if filtered.albedo is not None:
+        albedo = _planes(filtered.albedo, count)[index]
+        # Light must not mix with what it lights, but may be brighter by any factor.
+        brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
+        surfaces = np.clip(albedo, 0, 1) + brightness
+        if of_alpha:
+            scaled.append(("alpha", surfaces[:, :, :1], 3 * _ALBEDO_PENALTY))
+        else:
+            scaled.append(("albedo", surfaces, _ALBEDO_PENALTY))
+    if filtered.normal is not None:
+        normal = np.clip(_planes(filtered.normal, count)[index], -1, 1)
+        scaled.append(("normal", normal, _NORMAL_PENALTY))
+    if filtered.depth is not None:
+        depth = _planes(filtered.depth, count)[index]
+        # Bounded for any unit of length; near and far surfaces stay apart.
+        bounded = np.float32(_DEPTH_SCALE) * depth / (depth + np.float32(depth_scale))
+        scaled.append(("depth", bounded, _DEPTH_PENALTY))
+    return {
+        f"{name}.{channel}": (image[:, :, column], penalty)
+        for name, image, penalty in scaled
+        for column, channel in enumerate(_CHANNELS[name])
+    }
+
+
+def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
+    """Both halves of a feature, or its mean alone for one colour."""
+    return feature.halves_or_mean if count == 2 else (feature.mean,)
+
+
+def divisor(albedo: FloatImage) -> FloatImage:
+    """Return the albedo by which the colour is divided, shape (height, width, 3), never 0."""
+    black = channel_mean(albedo) < _BLACK_ALBEDO
+    return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
+
+
+def along_edges(image: FloatImage, edges: FloatImage, radius: float, threads: int) -> FloatImage:
+    """Return the mean along edges (a structure tensor), with this standard deviation in pixels."""
+    return _core.smooth_along_edges(
+        np.ascontiguousarray(image), edges, along=radius, across=_ACROSS_EDGES, threads=threads
+    )
