@@ -1,8 +1,8 @@
-"""Makes the result from a network's output: the image, its error, and whether it is better than the input."""
+"""Makes the denoised image of a network's output, unless the input is as good."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tungsten_dip.fit.error import epsilon_of_renderer, error_from_halves, estim
 from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.exposure import exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_lost_detail
-from tungsten_dip.fit.result import FitResult, HistoryPoint
+from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 
 _ERROR_RADIUS = 4
@@ -54,17 +54,20 @@ def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: C
     )
 
 
-def result_from_fused(
-    evidence: Evidence,
-    fused: Halves,
-    whole: FloatImage | None,
-    settings: FitSettings,
-    clock: Clock,
-    iterations: int,
-    history: Sequence[HistoryPoint],
-    notes: Sequence[str],
-) -> FitResult:
-    """Make the result from the network's outputs for both halves, or from the input if that is as good.
+@dataclass(frozen=True, eq=False)
+class Denoised:
+    """The images of a result and what is known of them; the fields are those of `FitResult`."""
+
+    color: FloatImage
+    error: FloatImage
+    estimated_relmse: float
+    halves: Halves
+    gain: FloatImage | None
+    notes: tuple[str, ...]
+
+
+def denoised_image(evidence: Evidence, fused: Halves, whole: FloatImage | None) -> Denoised:
+    """Make the image from the network's outputs for both halves, or from the input if that is as good.
 
     ``whole`` are the pilots of all samples, blended with the mean of both halves' weights.
     """
@@ -81,24 +84,20 @@ def result_from_fused(
     half_a, half_b = evidence.halves
     squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
-    notes = [*evidence.notes, *notes]
     estimated, _ = error_from_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
+    notes: tuple[str, ...] = ()
     if estimated >= error_of_input:
-        notes.append("the input is as good as anything fitted to it, and is returned")
+        notes = ("the input is as good as anything fitted to it, and is returned",)
         image, fused = evidence.mean, evidence.halves
         epsilon = epsilon_of_renderer(evidence.scale)
         error = relative_error(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
     if evidence.gain is not None:
         image = image * evidence.gain
-    return FitResult(
+    return Denoised(
         color=unscaled(image, evidence.scale),
-        settings=settings,
-        seconds=clock.seconds(),
-        iterations=iterations,
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),
         halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
         gain=evidence.gain,
-        history=tuple(history),
-        notes=tuple(notes),
+        notes=notes,
     )

@@ -18,7 +18,7 @@ import numpy as np
 from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import result_from_fused, result_without_noise
+from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model, source_sha256
@@ -108,23 +108,33 @@ def fit_fusion(
 
     training, images = _trained(network, start, settings, preset, clock, progress, whole_pilots)
     fused, whole = _fused(network, start, images)
-    notes = (*halved.notes, *training.notes)
-    result = result_from_fused(
-        evidence, fused, whole, settings, clock, training.steps_done, training.history, notes
-    )
-    model = Model(
-        kind="pointwise",
-        planes=evidence.layout.planes,
-        weights=network.weights(),
-        settings=settings,
-        estimated_relmse=result.estimated_relmse,
-        source_sha256=source_sha256(buffers),
-        layout=evidence.layout,
-        standardisation=start.standardisation,
-    )
+    image = denoised_image(evidence, fused, whole)
     if not training.interrupted:
-        progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
-    return replace(result, model=model, halves_drawn=halved.drawn, interrupted=training.interrupted)
+        progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
+    return FitResult(
+        color=image.color,
+        settings=settings,
+        seconds=clock.seconds(),
+        iterations=training.steps_done,
+        error=image.error,
+        estimated_relmse=image.estimated_relmse,
+        halves=image.halves,
+        gain=image.gain,
+        halves_drawn=halved.drawn,
+        model=Model(
+            kind="pointwise",
+            planes=evidence.layout.planes,
+            weights=network.weights(),
+            settings=settings,
+            estimated_relmse=image.estimated_relmse,
+            source_sha256=source_sha256(buffers),
+            layout=evidence.layout,
+            standardisation=start.standardisation,
+        ),
+        history=tuple(training.history),
+        interrupted=training.interrupted,
+        notes=(*evidence.notes, *halved.notes, *training.notes, *image.notes),
+    )
 
 
 def _preset(settings: FitSettings, following: bool) -> _Preset:

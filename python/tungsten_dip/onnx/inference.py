@@ -13,7 +13,7 @@ from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import result_from_fused, result_without_noise
+from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.fusion import blends_all_samples
 from tungsten_dip.fit.model import Model, check_finite, check_planes
@@ -105,9 +105,21 @@ def infer_fusion(
     if blends_all_samples(settings, following=previous is not None):
         whole_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
     fused, whole = _fused(model, evidence, whole_pilots)
-    result = result_from_fused(evidence, fused, whole, settings, clock, 0, (), halved.notes)
+    image = denoised_image(evidence, fused, whole)
     progress(1.0, "inferred")
-    return replace(result, model=model, halves_drawn=halved.drawn)
+    return FitResult(
+        color=image.color,
+        settings=settings,
+        seconds=clock.seconds(),
+        iterations=0,
+        error=image.error,
+        estimated_relmse=image.estimated_relmse,
+        halves=image.halves,
+        gain=image.gain,
+        halves_drawn=halved.drawn,
+        model=model,
+        notes=(*evidence.notes, *halved.notes, *image.notes),
+    )
 
 
 def _fused(
