@@ -22,7 +22,7 @@ _CONFIDENCE = 4.0
 """An estimate may lie so many standard errors above the error estimated from the halves."""
 
 _SURE = 0.35
-"""Relative standard error of an estimated relMSE up to which it is used."""
+"""Relative standard error of an estimate up to which it is used."""
 
 _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
@@ -75,7 +75,7 @@ def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: Float
     epsilon = np.float32(RELMSE_EPSILON)
     for targets in pilots[:2]:
         mean, standard_error = error_from_halves(targets, fused_a, fused_b, epsilon)
-        if standard_error < _SURE * mean:
+        if is_sure(mean, standard_error):
             break
     relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
     return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
@@ -84,17 +84,40 @@ def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: Float
 def error_from_halves(
     targets: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
 ) -> tuple[float, float]:
-    """Return the mean error estimated from independent targets, and its standard error.
+    """Return the mean error of (fused_a + fused_b) / 2 by independent targets, and its standard error."""
+    noisy_a, noisy_b = (image.reshape(-1, 3) for image in targets)
+    of_one, variance = crossed_errors((noisy_a, noisy_b), (fused_a, fused_b))
+    denominator = (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon
+    return mean_and_standard_error(channel_mean(relative_error(of_one - variance, denominator)))
 
-    With targets a, b (noisy images of the truth) and outputs f_a, f_b for one half each, E (f_a - b)^2 is the
-    error of f_a plus the noise of b, E (a - b)^2 the noise of both, and E (f_a - f_b)^2 / 2 the variance of
-    one output; the mean of two has half of that.
+
+def crossed_errors(noisy: Halves, fused: Halves) -> Halves:
+    """Return the squared error of one half's result in the mean, and the variance of the mean of both.
+
+    ``noisy`` are independent images a, b of the truth r, and ``fused`` the results f_a, f_b of one of them
+    each. Then f_a is independent of the noise of b, and
+
+        E (f_a - b)^2 = E (f_a - r)^2 + Var b,      E (a - b)^2 = Var a + Var b,
+
+    so that ((f_a - b)^2 + (f_b - a)^2 - (a - b)^2) / 2 is in the mean the squared error of one result. Of
+    f = (f_a + f_b) / 2 it is less by (f_a - f_b)^2 / 4, the variance of f, since
+    ((x + y) / 2)^2 = (x^2 + y^2) / 2 - ((x - y) / 2)^2 holds for any x and y.
     """
-    a, b = (image.reshape(-1, 3) for image in targets)
-    crossed = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2 - (fused_a - fused_b) ** 2 / 4
-    error = channel_mean(relative_error(crossed, (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon))
-    spread = float(error.std(dtype=np.float64))
-    return float(error.mean(dtype=np.float64)), spread / math.sqrt(error.size)
+    (a, b), (fused_a, fused_b) = noisy, fused
+    of_one = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2
+    variance: FloatArray = (fused_a - fused_b) ** 2 / np.float32(4)
+    return of_one, variance
+
+
+def mean_and_standard_error(values: FloatArray) -> tuple[float, float]:
+    """Return the mean of independent values, and its standard error."""
+    spread = float(values.std(dtype=np.float64))
+    return float(values.mean(dtype=np.float64)), spread / math.sqrt(values.size)
+
+
+def is_sure(mean: float, standard_error: float) -> bool:
+    """Whether an unbiased estimate is precise enough to be used."""
+    return standard_error < _SURE * mean
 
 
 def relative_error(

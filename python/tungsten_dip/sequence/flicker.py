@@ -7,16 +7,12 @@ result and r the truth. What moves in the truth moves in r as well, so that moti
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
-
-_SURE = 0.35
-"""Relative standard error up to which the unbiased estimate is believed."""
+from tungsten_dip.fit.error import crossed_errors, is_sure, mean_and_standard_error
 
 
 def flicker(
@@ -33,30 +29,24 @@ def flicker(
 def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_noisy: Halves) -> float:
     """Return the flicker without a reference, from halves A and B of both frames.
 
-    ``fused`` and ``previous`` are what was made of the halves ``noisy`` and ``previous_noisy`` (a, b), each
-    of its own half alone, through all frames. Then D f_a is independent of the noise of D b, and with D r the
-    change of the truth
+    ``fused`` and ``previous`` are what was made of the halves ``noisy`` and ``previous_noisy``, each of its
+    own half alone, through all frames. The change from frame to frame of one half's result is then
+    independent of the noise of the other half's change, and the error of the change is estimated as that of
+    an image (`crossed_errors`).
 
-        E (D f_a - D b)^2 = E (D f_a - D r)^2 + Var D b,      E (D a - D b)^2 = Var D a + Var D b,
-
-    so that ((D f_a - D b)^2 + (D f_b - D a)^2 - (D a - D b)^2) / 2 is in the mean the flicker of one half's
-    result. Of f = (f_a + f_b) / 2 it is less by (D f_a - D f_b)^2 / 4, since
-    ((x + y) / 2)^2 = (x^2 + y^2) / 2 - ((x - y) / 2)^2 holds for any x and y.
-
-    Without bias, but with the noise of the input in it: where its standard error is above a third of it,
-    E (D f_a - D f_b)^2 / 4 is returned, the variance of D f. It is the part of the flicker that is noise, and
-    lacks what the results of both halves have in common.
+    Without bias, but with the noise of the input in it: where that is too large, the variance of the result's
+    change is returned. It is the part of the flicker that is noise, and lacks what the results of both halves
+    have in common.
     """
-    d_fused_a, d_fused_b = fused[0] - previous[0], fused[1] - previous[1]
-    d_a, d_b = noisy[0] - previous_noisy[0], noisy[1] - previous_noisy[1]
+    d_fused, d_noisy = _change(fused, previous), _change(noisy, previous_noisy)
     denominator = _denominator(_mean(fused), _mean(previous))
-    spread = channel_mean((d_fused_a - d_fused_b) ** 2 / 4 / denominator)
-    crossed = (d_fused_a - d_b) ** 2 + (d_fused_b - d_a) ** 2 - (d_a - d_b) ** 2
-    unbiased = channel_mean(crossed / 2 / denominator) - spread
-    mean = float(unbiased.mean(dtype=np.float64))
-    if float(unbiased.std(dtype=np.float64)) < _SURE * mean * math.sqrt(unbiased.size):
-        return mean
-    return float(spread.mean(dtype=np.float64))
+    of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_fused))
+    mean, standard_error = mean_and_standard_error(of_one - variance)
+    return mean if is_sure(mean, standard_error) else float(variance.mean(dtype=np.float64))
+
+
+def _change(halves: Halves, previous: Halves) -> Halves:
+    return halves[0] - previous[0], halves[1] - previous[1]
 
 
 def _mean(halves: Halves) -> FloatImage:
