@@ -19,7 +19,7 @@ from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.fireflies import Limited, limit_fireflies
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.neighbours import mean_around
-from tungsten_dip.fit.oidn import oidn_image
+from tungsten_dip.fit.oidn import oidn_pilot
 from tungsten_dip.fit.pilots import (
     DRAFT_PILOTS,
     FOLLOWING_PILOTS,
@@ -126,7 +126,8 @@ def evidence_from_buffers(
     candidates = [_scaled_halves(pair, scale) for pair in image.candidates]
     if settings.pilot == "oidn":
         # The last of them: `pilots_of_all_samples` relies on it.
-        candidates.append(_scaled_halves(_oidn_halves(buffers, halves, scale, settings.threads), scale))
+        a, b = oidn_pilot(buffers, halves, scale, threads)
+        candidates.append((a, b))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
         _check_fits(layout, guidance[0], len(candidates) + (previous is not None), image.drawn)
@@ -235,8 +236,7 @@ def pilots_of_all_samples(
         computed.append(maker.images(pilot)[0] * occupied)
     candidates = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        image = _oidn_mean(buffers, evidence.mean / np.float32(evidence.scale), evidence.threads)
-        candidates[-1] = scaled(image, evidence.scale)
+        (candidates[-1],) = oidn_pilot(buffers, colors, evidence.scale, evidence.threads)
     return (evidence.mean, *computed, *candidates)
 
 
@@ -295,30 +295,6 @@ def _feature(guidance: Guidance, name: str) -> FloatImage:
     if name in guidance.names:
         return guidance.features[:, :, guidance.names.index(name)]
     return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
-
-
-def _oidn_mean(buffers: RenderBuffers, color: FloatImage, threads: int | None) -> FloatImage:
-    """Return the result of Open Image Denoise for all samples, never negative."""
-    albedo, normal = (None if f is None else f.mean for f in (buffers.albedo, buffers.normal))
-    return np.maximum(oidn_image(color, albedo, normal, threads=threads), 0)
-
-
-def _oidn_halves(buffers: RenderBuffers, halves: Halves, scale: float, threads: int | None) -> Halves:
-    """Return the result of Open Image Denoise for each half, with the features of that half alone."""
-
-    def of_half(feature: Buffer | None, half: int) -> FloatImage | None:
-        return None if feature is None else feature.halves_or_mean[half]
-
-    a, b = (
-        oidn_image(
-            halves[half] / np.float32(scale),
-            of_half(buffers.albedo, half),
-            of_half(buffers.normal, half),
-            threads=threads,
-        )
-        for half in (0, 1)
-    )
-    return a, b
 
 
 def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:

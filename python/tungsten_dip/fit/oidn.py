@@ -6,6 +6,7 @@ https://www.openimagedenoise.org, through the package ``pyoidn``, on the CPU.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
+from tungsten_dip.fit.exposure import scaled
 
 _LOG = logging.getLogger(__name__)
 
@@ -75,3 +77,24 @@ def oidn_image(
     if error is not None:
         raise InputError(f"Open Image Denoise: {' '.join(error.split())}; use another method on this machine")
     return images["output"]
+
+
+def oidn_pilot(
+    buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
+) -> tuple[FloatImage, ...]:
+    """Denoise both halves, each with its own features alone, or the mean; the results are never negative.
+
+    ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
+    shape (height, width, 3). So are the results.
+    """
+
+    def of_colors(feature: Buffer | None) -> Sequence[FloatImage | None]:
+        if feature is None:
+            return [None] * len(colors)
+        return feature.halves_or_mean if len(colors) == 2 else (feature.mean,)
+
+    features = of_colors(buffers.albedo), of_colors(buffers.normal)
+    return tuple(
+        np.maximum(scaled(oidn_image(color / np.float32(scale), *given, threads=threads), scale), 0)
+        for color, *given in zip(colors, *features, strict=True)
+    )
