@@ -19,13 +19,16 @@ from tungsten_dip.fit.exposure import exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_lost_detail
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.progress import Progress
 
 _ERROR_RADIUS = 4
 _CONVERGED = 1e-5
 """relMSE of an image that nothing can improve: noise of 0.3% of the radiance."""
 
 
-def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: Clock) -> FitResult | None:
+def result_without_noise(
+    buffers: RenderBuffers, settings: FitSettings, clock: Clock, progress: Progress
+) -> FitResult | None:
     """Return the image as it is if its halves hardly differ, else None.
 
     Copies do not differ at all: they count as free of noise only if the variance confirms it.
@@ -41,6 +44,7 @@ def result_without_noise(buffers: RenderBuffers, settings: FitSettings, clock: C
     estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
     if max(estimated) >= _CONVERGED or estimated == [0]:
         return None
+    progress(1.0, "no noise")
     error = channel_mean(relative_error(noise, squared + RELMSE_EPSILON).astype(np.float32))
     return FitResult(
         color=color.mean.copy(),

@@ -8,7 +8,7 @@ preserved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
@@ -81,9 +81,8 @@ def fit_fusion(
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
     clock = Clock(settings.time_budget_s)
-    unchanged = result_without_noise(buffers, settings, clock)
+    unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
-        progress(1.0, "no noise")
         return unchanged
     halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
     following = previous is not None
@@ -100,13 +99,7 @@ def fit_fusion(
         settings.device,
         evidence.threads,
     )
-
-    def whole_pilots(given_up: Event) -> tuple[FloatImage, ...]:
-        if not preset.all_samples:
-            return ()
-        return pilots_of_all_samples(evidence, halved.buffers, settings, clock, given_up)
-
-    training, images = _trained(network, start, settings, preset, clock, progress, whole_pilots)
+    training, images = _trained(network, start, halved.buffers, settings, preset, clock, progress)
     fused, whole = _fused(network, start, images)
     image = denoised_image(evidence, fused, whole)
     if not training.interrupted:
@@ -169,21 +162,24 @@ def _pilots(
 def _trained(
     network: PointwiseNetwork,
     start: Start,
+    buffers: RenderBuffers,
     settings: FitSettings,
     preset: _Preset,
     clock: Clock,
     progress: Progress,
-    whole_pilots: Callable[[Event], tuple[FloatImage, ...]],
 ) -> tuple[Training, tuple[FloatImage, ...]]:
-    """Train the network and compute the pilots of all samples meanwhile; return both.
+    """Train the network and compute the preset's pilots of all samples meanwhile; return both.
 
-    ``whole_pilots`` is to return none once the event that it is given is set: Ctrl-C ends both early.
+    Ctrl-C ends both early, then without pilots.
     """
     given_up = Event()
     training: Training | None = None
     # Each network keeps one core busy; the pilots of all samples take what is left of all of them.
     with ThreadPoolExecutor(1) as beside:
-        pending = beside.submit(whole_pilots, given_up)
+        if preset.all_samples:
+            pending = beside.submit(pilots_of_all_samples, start.evidence, buffers, settings, clock, given_up)
+        else:
+            pending = beside.submit(tuple)
         try:
             if start.evidence.threads == 1:
                 _wait_for(pending)

@@ -94,9 +94,8 @@ def infer_fusion(
     clock = Clock()
     assert model.layout is not None
     settings = _settings(model, threads)
-    unchanged = result_without_noise(buffers, settings, clock)
+    unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
-        progress(1.0, "no noise")
         return unchanged
     halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
     layout = model.layout
