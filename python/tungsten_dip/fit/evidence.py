@@ -73,9 +73,9 @@ class Evidence:
         return self.pilots[0]
 
     @property
-    def smooth(self) -> Halves:
-        """The last of the computed pilots: what errors are relative to."""
-        return self.pilots[len(self.layout.pilots)]
+    def denominators(self) -> Halves:
+        """What squared errors are relative to, per half, shape (height, width, 1)."""
+        return _denominators(self.pilots[self.layout.denominator])
 
     def pilots_at(self, pixels: Indices) -> tuple[Halves, ...]:
         """Return the pilots at some pixels, shape (pixels, 3)."""
@@ -141,9 +141,11 @@ def evidence_from_buffers(
         candidates.append(filled)
 
     images = (halves, *computed, *candidates)
-    reference, noises = _judged(images, computed[-1], threads, None if layout is None else layout.reference)
+    denominators = _denominators(computed[-1])
     if layout is None:
+        reference = _best(images, denominators)
         layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(candidates), reference)
+    noises = _noises(_errors(images[layout.reference], halves, denominators), threads)
     features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
     notes = _notes_on_features(buffers)
     if limited.note is not None:
@@ -242,28 +244,23 @@ def pilots_of_all_samples(
 
 def with_best_reference(evidence: Evidence) -> Evidence:
     """Return the same evidence with the pilot that is best on this image as the reference."""
-    reference, noises = _judged(evidence.pilots, evidence.smooth, evidence.threads)
+    pilots, denominators = evidence.pilots, evidence.denominators
+    reference = _best(pilots, denominators)
+    noises = _noises(_errors(pilots[reference], evidence.halves, denominators), evidence.threads)
     return replace(evidence, layout=replace(evidence.layout, reference=reference), noises=noises)
 
 
-def _judged(
-    images: Sequence[Halves], smooth: Halves, threads: int, reference: int | None = None
-) -> tuple[int, Halves]:
-    """Return the index of the reference and `Evidence.noises`.
-
-    ``images`` are the noisy halves, then the pilots, the best of which is the reference if none is given.
-    """
-    denominators = denominators_of(smooth)
-    if reference is None:
-        mean_errors = [
-            sum(float(np.minimum(error, 1).mean()) for error in _errors(image, images[0], denominators))
-            for image in images[1:]
-        ]
-        reference = 1 + int(np.argmin(mean_errors))
-    return reference, _noises(_errors(images[reference], images[0], denominators), threads)
+def _best(images: Sequence[Halves], denominators: Halves) -> int:
+    """Return the index of the best pilot; ``images`` are the noisy halves, then the pilots."""
+    mean_errors = [
+        sum(float(np.minimum(error, 1).mean()) for error in _errors(image, images[0], denominators))
+        for image in images[1:]
+    ]
+    return 1 + int(np.argmin(mean_errors))
 
 
 def _noises(errors_of_reference: Halves, threads: int) -> Halves:
+    """Return `Evidence.noises`."""
     a, b = (
         # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
         np.maximum(mean_around(_capped(error, threads), _NOISE_RADIUS, threads), 0)
@@ -320,9 +317,8 @@ def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
     return (f"no {', '.join(missing)}: edges are found with less evidence{instead}",)
 
 
-def denominators_of(smooth: Halves) -> Halves:
-    """What squared errors are relative to, per half, shape (height, width, 1)."""
-    a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in smooth)
+def _denominators(pilot: Halves) -> Halves:
+    a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in pilot)
     return a, b
 
 

@@ -47,6 +47,11 @@ class Layout:
         return 1 + len(self.pilots) + self.candidates
 
     @property
+    def denominator(self) -> int:
+        """The index of the pilot that all errors are relative to: the last that filters compute."""
+        return len(self.pilots)
+
+    @property
     def planes(self) -> tuple[str, ...]:
         """The names of what `planes_of_half` yields, in its order."""
         return (

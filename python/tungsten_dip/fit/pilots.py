@@ -38,7 +38,8 @@ FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
 EDGES = Pilot(EDGES_RADIUS, along_edges=True)
 
 # In order of cost. Small windows keep detail, large ones average out the remaining noise; guided ones keep
-# shadows and reflections, which no feature contains; a regression on the position follows gradients.
+# shadows and reflections, which no feature contains; a regression on the position follows gradients. Errors
+# are relative to the last one that is computed (`Layout.denominator`).
 DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
 BALANCED_PILOTS = (
     Pilot(1),

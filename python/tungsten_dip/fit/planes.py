@@ -18,7 +18,6 @@ from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import (
     OUTLIER,
     Evidence,
-    denominators_of,
     squared_error,
 )
 from tungsten_dip.fit.layout import SCORE_RADII
@@ -56,11 +55,10 @@ def loss_weights(evidence: Evidence) -> Halves:
     Relative to pilots of the half itself, never to the half that scores it: a pixel must not count less
     because the noise that it is compared with is bright, or the image would darken.
     """
-    denominators = denominators_of(evidence.smooth)
     with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
         weight_a, weight_b = (
             np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
-            for d, noise in zip(denominators, evidence.noises, strict=True)
+            for d, noise in zip(evidence.denominators, evidence.noises, strict=True)
         )
     return weight_a, weight_b
 
@@ -80,7 +78,7 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
-    denominator = denominators_of(evidence.smooth)[half]
+    denominator = evidence.denominators[half]
     cap = np.float32(OUTLIER) * noise + np.float32(_LEAST_CAP)
     reference = np.minimum(squared_error(evidence.pilots[layout.reference][half], other, denominator), cap)
     for index, pilot in enumerate(evidence.pilots):
