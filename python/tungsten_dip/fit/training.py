@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray, Indices
+from tungsten_dip.buffers.model import FloatArray, Halves, Indices
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error
@@ -131,6 +131,33 @@ def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Gen
                 yield pool.part(end - size, end)
 
 
+@dataclass(frozen=True)
+class _Probe:
+    """Pixels by which a training is judged: their pilots, and the examples of each half."""
+
+    pilots: tuple[Halves, ...]
+    examples: tuple[Examples, Examples]
+    scale: float
+    threads: int
+
+    def errors(self, network: PointwiseNetwork) -> tuple[float, float]:
+        """Return the estimated error, and the error on the other half."""
+        fused_a, fused_b = in_pair(lambda half: network.fuse(self.examples[half]), self.threads)
+        errors = estimate_error(self.pilots, self.scale, fused_a, fused_b)
+        return float(errors.mean(dtype=np.float64)), held_out_error(self.pilots, fused_a, fused_b)
+
+
+def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
+    """Set pixels aside; return them, and the others, which are trained on. Tiny images have but one set."""
+    pixels = len(start.examples.inputs) // 2
+    order = rng.permutation(pixels)
+    probed = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
+    probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
+    evidence, examples = start.evidence, start.examples
+    of_halves = examples.of_half(0).at(probe), examples.of_half(1).at(probe)
+    return _Probe(evidence.pilots_at(probe), of_halves, evidence.scale, evidence.threads), trained
+
+
 @dataclass
 class Training:
     """How far a training went."""
@@ -178,28 +205,17 @@ def train(
     halves, falls no further.
     """
     rng = np.random.default_rng(settings.seed)
-    threads = start.evidence.threads
-    pixels = len(start.examples.inputs) // 2
-    order = rng.permutation(pixels)
-    probed = min(_PROBE_PIXELS, pixels // _PROBE_SHARE)
-    probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
-    pilots = start.evidence.pilots_at(probe)
-    probes = [start.examples.of_half(half).at(probe) for half in (0, 1)]
+    probe, trained = _probe(start, rng)
     batches = _batches(start.examples, trained, batch_pixels, rng)
     done = Training(notes=list(start.notes))
-
-    def estimate(step: int) -> tuple[float, float]:
-        """Return the estimated error, and the error on the other half."""
-        fused_a, fused_b = in_pair(lambda half: network.fuse(probes[half]), threads)
-        errors = estimate_error(pilots, start.evidence.scale, fused_a, fused_b)
-        error = float(errors.mean(dtype=np.float64))
-        done.history.append(HistoryPoint(clock.seconds(), step, error))
-        return error, held_out_error(pilots, fused_a, fused_b)
-
     every = _WARM_HISTORY_EVERY if start.warm else _HISTORY_EVERY
     spent_before = clock.share_spent()
     left = max(1 - spent_before, 1e-9)
-    stopping = _EarlyStopping(estimate(0)[1], network.weights()) if start.warm else None
+    stopping = None
+    if start.warm:
+        error, held_out = probe.errors(network)
+        done.history.append(HistoryPoint(clock.seconds(), 0, error))
+        stopping = _EarlyStopping(held_out, network.weights())
     try:
         for step in range(1, steps + 1):
             rate = min(1.0, step / _WARM_UP_STEPS)
@@ -210,18 +226,14 @@ def train(
             done.steps_done = step
             if step % every != 0 and step != steps and step != 1:
                 continue
-            error, held_out = estimate(step)
+            error, held_out = probe.errors(network)
+            done.history.append(HistoryPoint(clock.seconds(), step, error))
             progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
             if stopping is not None:
                 stopping.record(held_out, network)
-            if error <= (settings.target_error or -math.inf):
-                done.notes.append(f"stopped at step {step}: the target error is reached")
-                break
-            if clock.share_spent() > 1:
-                done.notes.append(f"stopped at step {step}: the time budget is spent")
-                break
-            if stopping is not None and stopping.reached:
-                done.notes.append(f"stopped at step {step}: the error falls no further")
+            reason = _reason_to_stop(error, settings, clock, stopping)
+            if reason is not None:
+                done.notes.append(f"stopped at step {step}: {reason}")
                 break
     except KeyboardInterrupt:
         done.interrupted = True
@@ -229,3 +241,15 @@ def train(
     if stopping is not None:
         network.load(stopping.weights)
     return done
+
+
+def _reason_to_stop(
+    error: float, settings: FitSettings, clock: Clock, stopping: _EarlyStopping | None
+) -> str | None:
+    if error <= (settings.target_error or -math.inf):
+        return "the target error is reached"
+    if clock.share_spent() > 1:
+        return "the time budget is spent"
+    if stopping is not None and stopping.reached:
+        return "the error falls no further"
+    return None
