@@ -31,19 +31,22 @@ _SAMPLES_OF_GUIDE = 12
 noise, which is taken to be that of the image divided by this."""
 
 
-FIRST_GUIDE = Pilot(radius=3)
-FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
+_FIRST_GUIDE = Pilot(radius=3)
+_FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
 """Without features, a window blurs every edge within it."""
 
-EDGES = Pilot(EDGES_RADIUS, along_edges=True)
+_SECOND_GUIDE = Pilot(radius=8, k=1.0, step=2)
+"""Guided by the first, it is the guide of all pilots."""
+
+_EDGES = Pilot(EDGES_RADIUS, along_edges=True)
 
 # In order of cost. Small windows keep detail, large ones average out the remaining noise; guided ones keep
 # shadows and reflections, which no feature contains; a regression on the position follows gradients. Errors
 # are relative to the last one that is computed (`Layout.denominator`).
-DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
+DRAFT_PILOTS = (Pilot(1), _EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
 BALANCED_PILOTS = (
     Pilot(1),
-    EDGES,
+    _EDGES,
     Pilot(5),
     Pilot(12, step=2, with_position=True),
     Pilot(4, k=1.0),
@@ -60,10 +63,10 @@ FINAL_PILOTS = (
 )
 
 # Enough beside the previous frame. The first replaces it where it has no value.
-FOLLOWING_DRAFT_PILOTS = (Pilot(1), EDGES, Pilot(8, step=4, with_position=True))
+FOLLOWING_DRAFT_PILOTS = (Pilot(1), _EDGES, Pilot(8, step=4, with_position=True))
 FOLLOWING_PILOTS = (
     Pilot(1),
-    EDGES,
+    _EDGES,
     Pilot(12, step=3, with_position=True),
     Pilot(6, k=2.0, step=3),
     Pilot(4, k=1.0, by_color=True),
@@ -92,14 +95,13 @@ def first_guides(
     ``variance`` (same shape).
     """
     irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
-    first = FIRST_GUIDE if guidance[0].penalty else FIRST_GUIDE_WITHOUT_FEATURES
+    first = _FIRST_GUIDE if guidance[0].penalty else _FIRST_GUIDE_WITHOUT_FEATURES
     smooth = tuple(
         np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
     )
     guides = _guides(smooth, irradiances, guidance[0], variance)
-    second = Pilot(radius=8, k=1.0, step=2)
     smooth = tuple(
-        np.maximum(_regress(image, second, g, guide, guides.noise), 0)
+        np.maximum(_regress(image, _SECOND_GUIDE, g, guide, guides.noise), 0)
         for image, guide, g in zip(irradiances, guides.images, guidance, strict=True)
     )
     return _guides(smooth, irradiances, guidance[0], variance)

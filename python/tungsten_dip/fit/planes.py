@@ -79,6 +79,7 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
 
     other = evidence.halves[1 - half]
     denominator = evidence.denominators[half]
+    unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
     cap = np.float32(OUTLIER) * noise + np.float32(_LEAST_CAP)
     reference = np.minimum(squared_error(evidence.pilots[layout.reference][half], other, denominator), cap)
     for index, pilot in enumerate(evidence.pilots):
@@ -91,7 +92,6 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
         worse = np.minimum(squared_error(pilot[half], other, denominator), cap) - reference
         for radius in SCORE_RADII:
-            unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
             score = mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]
 
