@@ -27,7 +27,7 @@ def _noisy(sigma: float, seed: int) -> Halves:
 
 
 def _mean_estimate(pilots: list[Halves], fused: Halves) -> float:
-    errors: FloatArray = estimate_error(pilots, 1.0, *fused)
+    errors: FloatArray = estimate_error(pilots, 1.0, fused)
     assert errors.shape == (PIXELS,)
     return float(errors.mean(dtype=np.float64))
 
@@ -60,7 +60,7 @@ def test_the_held_out_error_is_told_by_the_halves_or_where_they_are_too_noisy_by
 ) -> None:
     """Of the two, the other one would be far off."""
     smallest = _constant(TRUTH) if sigma > 1 else _constant(TRUTH + 5)
-    error = held_out_error([_noisy(sigma, seed=4), smallest], *_constant(TRUTH + bias))
+    error = held_out_error([_noisy(sigma, seed=4), smallest], _constant(TRUTH + bias))
     assert error == pytest.approx(bias**2 / ((TRUTH + bias) ** 2 + 0.01), rel=0.05)
 
 

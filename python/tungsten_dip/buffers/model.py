@@ -159,6 +159,12 @@ class RenderBuffers:
         return replace(self, source=None, **buffers)  # type: ignore[arg-type]
 
 
+def mean_of(halves: Halves) -> FloatImage:
+    """Return the mean of both halves."""
+    mean: FloatImage = np.float32(0.5) * (halves[0] + halves[1])
+    return mean
+
+
 def _differs(now: object, read: object) -> bool:
     """Whether this is another image, or another number."""
     if isinstance(now, (int, float)) and isinstance(read, (int, float)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves
+from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
@@ -25,7 +25,7 @@ def with_all_samples(fused: Halves, whole: FloatImage, threads: int) -> FloatIma
     differ in the surrounding pixels, and less where they differ strongly.
     """
     a, b = fused
-    image = np.float32(0.5) * (a + b)
+    image = mean_of(fused)
     spread = _core.box_mean(channel_mean(np.float32(0.25) * (a - b) ** 2), _SPREAD_RADIUS, threads)
     level = _core.box_mean(channel_mean(image), _SPREAD_RADIUS, threads)
     agreed = (np.float32(_AGREED) * level) ** 2

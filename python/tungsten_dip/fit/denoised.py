@@ -8,7 +8,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
@@ -76,19 +76,16 @@ def denoised_image(evidence: Evidence, fused: Halves, whole: FloatImage | None) 
     ``whole`` are the pilots of all samples, blended with the mean of both halves' weights.
     """
     threads = evidence.threads
-    shape = fused[0].shape
     fused = with_lost_detail(evidence.halves, fused)
-    fused_a, fused_b = (half.reshape(-1, 3) for half in fused)
-    image = np.float32(0.5) * (fused[0] + fused[1])
-    if whole is not None:
-        image = with_all_samples(fused, whole, threads)
-    error = estimate_error(evidence.pilots, evidence.scale, fused_a, fused_b).reshape(*shape[:2], 1)
+    image = mean_of(fused) if whole is None else with_all_samples(fused, whole, threads)
+    pixels = fused[0].reshape(-1, 3), fused[1].reshape(-1, 3)
+    error = estimate_error(evidence.pilots, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
     squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
-    estimated, _ = error_from_halves(evidence.halves, fused_a, fused_b, np.float32(RELMSE_EPSILON))
+    estimated, _ = error_from_halves(evidence.halves, pixels, np.float32(RELMSE_EPSILON))
     notes: tuple[str, ...] = ()
     if estimated >= error_of_input:
         notes = ("the input is as good as anything fitted to it, and is returned",)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, Halves
+from tungsten_dip.buffers.model import FloatArray, Halves, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 
 _CHUNK_PIXELS = 1 << 18
@@ -28,22 +28,20 @@ _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
-def estimate_error(
-    pilots: Sequence[Halves], scale: float, fused_a: FloatArray, fused_b: FloatArray
-) -> FloatArray:
-    """Estimate the squared error of f = (fused_a + fused_b) / 2 in each pixel, relative to f^2 + 0.01.
+def estimate_error(pilots: Sequence[Halves], scale: float, fused: Halves) -> FloatArray:
+    """Estimate the squared error of the mean f of both outputs in each pixel, relative to f^2 + 0.01.
 
-    ``pilots`` and ``scale`` are the evidence's, ``fused_a`` and ``fused_b`` outputs for one half each, shape
+    ``pilots`` and ``scale`` are the evidence's, ``fused`` the outputs f_a and f_b for one half each, shape
     (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
-    (fused_a - fused_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
+    (f_a - f_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
     they differ from f where there is something to blur; but some are far off where the network rightly
     avoids them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric
     mean of the variance and the median squared difference of f and the pilots, or less if the noisy halves
     imply a smaller mean error (see `error_from_halves`).
     """
-    output = np.float32(0.5) * (fused_a + fused_b)
+    output = mean_of(fused)
     epsilon = epsilon_of_renderer(scale)
-    squared = (fused_a - fused_b) ** 2 / 4
+    squared = (fused[0] - fused[1]) ** 2 / 4
     variance = np.empty(len(output), np.float32)
     bias = np.empty(len(output), np.float32)
     computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
@@ -52,20 +50,20 @@ def estimate_error(
         relative = 1 / (output[part] ** 2 + epsilon)
         with np.errstate(over="ignore"):
             apart = [
-                channel_mean((np.float32(0.5) * (a[part] + b[part]) - output[part]) ** 2 * relative)[:, 0]
+                channel_mean((mean_of((a[part], b[part])) - output[part]) ** 2 * relative)[:, 0]
                 for a, b in computed
             ]
             variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
             apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
         # The root of each: their product would overflow.
         bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
-    estimated, standard_error = error_from_halves(pilots[0], fused_a, fused_b, epsilon)
+    estimated, standard_error = error_from_halves(pilots[0], fused, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
-def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: FloatArray) -> float:
+def held_out_error(pilots: Sequence[Halves], fused: Halves) -> float:
     """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
@@ -74,20 +72,18 @@ def held_out_error(pilots: Sequence[Halves], fused_a: FloatArray, fused_b: Float
     """
     epsilon = np.float32(RELMSE_EPSILON)
     for targets in pilots[:2]:
-        mean, standard_error = error_from_halves(targets, fused_a, fused_b, epsilon)
+        mean, standard_error = error_from_halves(targets, fused, epsilon)
         if is_sure(mean, standard_error):
             break
-    relative = 1 / ((np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon)
-    return max(mean, float(((fused_a - fused_b) ** 2 / 4 * relative).mean(dtype=np.float64)))
+    relative = 1 / (mean_of(fused) ** 2 + epsilon)
+    return max(mean, float(((fused[0] - fused[1]) ** 2 / 4 * relative).mean(dtype=np.float64)))
 
 
-def error_from_halves(
-    targets: Halves, fused_a: FloatArray, fused_b: FloatArray, epsilon: np.float32
-) -> tuple[float, float]:
-    """Return the mean error of (fused_a + fused_b) / 2 by independent targets, and its standard error."""
+def error_from_halves(targets: Halves, fused: Halves, epsilon: np.float32) -> tuple[float, float]:
+    """Return the mean error of the mean of both outputs by independent targets, and its standard error."""
     noisy_a, noisy_b = (image.reshape(-1, 3) for image in targets)
-    of_one, variance = crossed_errors((noisy_a, noisy_b), (fused_a, fused_b))
-    denominator = (np.float32(0.5) * (fused_a + fused_b)) ** 2 + epsilon
+    of_one, variance = crossed_errors((noisy_a, noisy_b), fused)
+    denominator = mean_of(fused) ** 2 + epsilon
     return mean_and_standard_error(channel_mean(relative_error(of_one - variance, denominator)))
 
 

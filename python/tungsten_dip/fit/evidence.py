@@ -10,7 +10,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Indices, RenderBuffers
+from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Indices, RenderBuffers, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -193,7 +193,7 @@ def _without_fireflies(color: Buffer, scale: float, threads: int) -> tuple[Float
     limited = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
     if limited.gain is None:
         return scaled(color.mean, scale), limited
-    return np.float32(0.5) * (limited.halves[0] + limited.halves[1]), limited
+    return mean_of(limited.halves), limited
 
 
 def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:
@@ -236,7 +236,7 @@ def pilots_of_all_samples(
         if given_up is not None and given_up.is_set():
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
-    candidates = [np.float32(0.5) * (a + b) for a, b in evidence.pilots[1 + len(pilots) :]]
+    candidates = [mean_of(candidate) for candidate in evidence.pilots[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         (candidates[-1],) = oidn_pilot(buffers, colors, evidence.scale, evidence.threads)
     return (evidence.mean, *computed, *candidates)

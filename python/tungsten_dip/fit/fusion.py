@@ -13,9 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 
-import numpy as np
-
-from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
@@ -213,5 +211,6 @@ def _fused(
     fused = in_pair(lambda half: network.fuse(halves[half]).reshape(shape), threads)
     if not whole_pilots:
         return fused, None
-    by_a, by_b = in_pair(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
-    return fused, np.float32(0.5) * (by_a + by_b)
+    return fused, mean_of(
+        in_pair(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers, mean_of
 from tungsten_dip.buffers.prefilter import prefilter_features
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
@@ -156,7 +156,7 @@ def _with_planes(feature: Buffer, planes: tuple[FloatImage, ...]) -> Buffer:
     if feature.halves is None or len(planes) == 1:
         return replace(feature, mean=planes[0])
     a, b = planes
-    return Buffer(np.float32(0.5) * (a + b), a, b, feature.variance)
+    return Buffer(mean_of((a, b)), a, b, feature.variance)
 
 
 def _depth_scale(filtered: RenderBuffers) -> float:
@@ -221,7 +221,7 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
         for around in (_core.box_mean(np.maximum(half - 1, 0), _STRAY_RADIUS, threads) for half in (b, a))
     )
     kept_a, kept_b = (np.minimum(half, limit) for half, limit in zip((a, b), limits, strict=True))
-    taken = np.float32(0.5) * ((a - kept_a) + (b - kept_b))
+    taken = mean_of((a - kept_a, b - kept_b))
     return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
 
 

@@ -142,9 +142,9 @@ class _Probe:
 
     def errors(self, network: PointwiseNetwork) -> tuple[float, float]:
         """Return the estimated error, and the error on the other half."""
-        fused_a, fused_b = in_pair(lambda half: network.fuse(self.examples[half]), self.threads)
-        errors = estimate_error(self.pilots, self.scale, fused_a, fused_b)
-        return float(errors.mean(dtype=np.float64)), held_out_error(self.pilots, fused_a, fused_b)
+        fused = in_pair(lambda half: network.fuse(self.examples[half]), self.threads)
+        errors = estimate_error(self.pilots, self.scale, fused)
+        return float(errors.mean(dtype=np.float64)), held_out_error(self.pilots, fused)
 
 
 def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:

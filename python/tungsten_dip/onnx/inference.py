@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.display import radiance_from_ldr
-from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import denoise
@@ -154,7 +154,7 @@ def _fused(
         return fused
 
     (half_a, *by_a), (half_b, *by_b) = in_pair(of_half, evidence.threads)
-    whole = np.float32(0.5) * (by_a[0] + by_b[0]) if whole_pilots else None
+    whole = mean_of((by_a[0], by_b[0])) if whole_pilots else None
     return (half_a, half_b), whole
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves
+from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.fit.error import crossed_errors, is_sure, mean_and_standard_error
 
@@ -39,7 +39,7 @@ def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_n
     have in common.
     """
     d_fused, d_noisy = _change(fused, previous), _change(noisy, previous_noisy)
-    denominator = _denominator(_mean(fused), _mean(previous))
+    denominator = _denominator(mean_of(fused), mean_of(previous))
     of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_fused))
     mean, standard_error = mean_and_standard_error(of_one - variance)
     return mean if is_sure(mean, standard_error) else float(variance.mean(dtype=np.float64))
@@ -47,11 +47,6 @@ def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_n
 
 def _change(halves: Halves, previous: Halves) -> Halves:
     return halves[0] - previous[0], halves[1] - previous[1]
-
-
-def _mean(halves: Halves) -> FloatImage:
-    mean: FloatImage = np.float32(0.5) * (halves[0] + halves[1])
-    return mean
 
 
 def _denominator(image: FloatImage, previous: FloatImage) -> FloatImage:
