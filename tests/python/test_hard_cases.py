@@ -98,7 +98,7 @@ def test_a_learning_rate_too_high_does_no_harm(preset: str, monkeypatch: pytest.
 
 
 def test_the_published_method_survives_a_learning_rate_too_high(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tungsten_dip.fit.published.fit.LEARNING_RATE", 0.1)
+    monkeypatch.setattr("tungsten_dip.fit.paper.fit.LEARNING_RATE", 0.1)
     assert measure(denoise(healthy().buffers, replace(PAPER, iterations=30)), healthy()).finite
 
 
@@ -130,8 +130,8 @@ def double_precision():
 @pytest.mark.usefixtures("double_precision")
 @pytest.mark.parametrize("network", ["skip", "resnet"])
 def test_gradients_of_the_published_loss(network: str) -> None:
-    from tungsten_dip.fit.published.fit import PaperFit
-    from tungsten_dip.fit.published.images import paper_images
+    from tungsten_dip.fit.paper.fit import PaperFit
+    from tungsten_dip.fit.paper.images import paper_images
 
     images = paper_images(healthy().buffers, replace(PAPER, inputs="all"))
     small = replace(

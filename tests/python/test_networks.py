@@ -6,8 +6,8 @@ torch = pytest.importorskip("torch")
 
 import torch.nn.functional as F  # noqa: E402, N812
 
-from tungsten_dip.fit.published import networks  # noqa: E402
-from tungsten_dip.fit.published.networks import ResNet, Skip, mirror_to_multiple  # noqa: E402
+from tungsten_dip.fit.paper import networks  # noqa: E402
+from tungsten_dip.fit.paper.networks import ResNet, Skip, mirror_to_multiple  # noqa: E402
 
 TINY = (4, 6)
 

@@ -103,7 +103,7 @@ def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, in
 def test_skip_agrees_with_torch(
     size: tuple[int, int], channels: tuple[int, ...], frame: SyntheticRender
 ) -> None:
-    from tungsten_dip.fit.published.networks import Skip
+    from tungsten_dip.fit.paper.networks import Skip
 
     fit = paper_model("skip", frame.buffers, channels=channels)
     network = Skip(len(fit.planes), 3, channels)
@@ -112,7 +112,7 @@ def test_skip_agrees_with_torch(
 
 @pytest.mark.parametrize("size", [*SIZES, (40, 18)])
 def test_resnet_agrees_with_torch(size: tuple[int, int], frame: SyntheticRender) -> None:
-    from tungsten_dip.fit.published.networks import ResNet
+    from tungsten_dip.fit.paper.networks import ResNet
 
     fit = paper_model("resnet", frame.buffers, scheme="ioc")
     assert fit.planes == ("random 0", "random 1", "random 2")
@@ -131,8 +131,8 @@ def check_paper(fit: Model, network: Any, size: tuple[int, int]) -> None:
 
 def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None:
     from tungsten_dip.buffers.display import radiance_from_ldr
-    from tungsten_dip.fit.published.images import network_input, paper_images
-    from tungsten_dip.fit.published.networks import Skip
+    from tungsten_dip.fit.paper.images import network_input, paper_images
+    from tungsten_dip.fit.paper.networks import Skip
 
     fit = paper_model("skip", frame.buffers)
     result = infer(fit, frame.buffers, threads=1)

@@ -9,8 +9,8 @@ from tungsten_dip.buffers.display import ldr_from_radiance, radiance_from_ldr  #
 from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.fit import denoise  # noqa: E402
-from tungsten_dip.fit.published.fit import BACKTRACK_DB, INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
-from tungsten_dip.fit.published.images import paper_images  # noqa: E402
+from tungsten_dip.fit.paper.fit import BACKTRACK_DB, INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402
+from tungsten_dip.fit.paper.images import paper_images  # noqa: E402
 from tungsten_dip.fit.settings import FitSettings  # noqa: E402
 from tungsten_dip.progress import silent  # noqa: E402
 

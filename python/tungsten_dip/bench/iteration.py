@@ -17,9 +17,9 @@ from tungsten_dip.bench.plain_skip import PlainFit, PlainSkip
 from tungsten_dip.bench.sets import CROP_MULTIPLE
 from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.published.device import compute_device
-from tungsten_dip.fit.published.fit import PaperFit
-from tungsten_dip.fit.published.images import paper_images
+from tungsten_dip.fit.paper.device import compute_device
+from tungsten_dip.fit.paper.fit import PaperFit
+from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 

@@ -17,7 +17,7 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.oidn import Quality, oidn_image
-from tungsten_dip.fit.published.constants import ITERATIONS
+from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.progress import Progress
 

@@ -7,8 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from tungsten_dip.buffers import FloatImage, RenderBuffers
+from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.preparation import prepared
-from tungsten_dip.fit.published.images import paper_images
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
@@ -34,10 +34,10 @@ def paper_curve(
 ) -> list[PaperPoint]:
     """Fit up to the largest of the checkpoints, and return what was reached at each.
 
-    Raises InputError as `fit.published.fit.fit_paper` does.
+    Raises InputError as `fit.paper.fit.fit_paper` does.
     """
-    from tungsten_dip.fit.published.device import compute_device
-    from tungsten_dip.fit.published.fit import PaperFit
+    from tungsten_dip.fit.paper.device import compute_device
+    from tungsten_dip.fit.paper.fit import PaperFit
 
     start = time.perf_counter()
     sampling_s = 0.0

@@ -23,9 +23,9 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
+from tungsten_dip.fit.paper.constants import ITERATIONS
+from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.preparation import prepared
-from tungsten_dip.fit.published.constants import ITERATIONS
-from tungsten_dip.fit.published.images import paper_images
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 

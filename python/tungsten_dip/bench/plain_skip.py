@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from tungsten_dip.fit.published.constants import LEAKY_SLOPE
-from tungsten_dip.fit.published.fit import (
+from tungsten_dip.fit.paper.constants import LEAKY_SLOPE
+from tungsten_dip.fit.paper.fit import (
     AVERAGE_WEIGHT,
     BACKTRACK_DB,
     INPUT_NOISE_STD,

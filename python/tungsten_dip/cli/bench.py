@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.cli.console import add_json, add_threads, duration, integers, progress_on_stderr
-from tungsten_dip.fit.published.constants import ITERATIONS
+from tungsten_dip.fit.paper.constants import ITERATIONS
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction

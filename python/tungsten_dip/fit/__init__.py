@@ -1,4 +1,4 @@
-"""Fits: from noisy buffers to a clean image. Only `published` imports torch."""
+"""Fits: from noisy buffers to a clean image. Only `paper` imports torch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
         require("torch", "preset paper")
         if settings.device == "cuda":
             with held_interrupts():
-                from tungsten_dip.fit.published.device import check_torch_device
+                from tungsten_dip.fit.paper.device import check_torch_device
 
             check_torch_device(settings.device)
     else:
@@ -84,7 +84,7 @@ def denoise(
         if known.candidates or known.previous is not None:
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
         with held_interrupts():
-            from tungsten_dip.fit.published.fit import fit_paper
+            from tungsten_dip.fit.paper.fit import fit_paper
 
         result = fit_paper(known.buffers, settings, progress, warm_start)
     else:

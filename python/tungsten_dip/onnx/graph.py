@@ -1,4 +1,4 @@
-"""The graphs of the networks: what `fit.pointwise` and `fit.published.networks` compute, in plain operators.
+"""The graphs of the networks: what `fit.pointwise` and `fit.paper.networks` compute, in plain operators.
 
 The height and width of the inputs are free. The images of a batch are independent: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
@@ -15,9 +15,7 @@ from onnx import TensorProto
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.pointwise import HIDDEN, members_of
-from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
-from tungsten_dip.fit.published.constants import (
+from tungsten_dip.fit.paper.constants import (
     LEAKY_SLOPE,
     NORM_EPSILON,
     RESNET_BLOCKS,
@@ -25,6 +23,8 @@ from tungsten_dip.fit.published.constants import (
     SIDE_CHANNELS,
     SIDE_SCALES,
 )
+from tungsten_dip.fit.pointwise import HIDDEN, members_of
+from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
 from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
@@ -97,7 +97,7 @@ class _Network(GraphBuilder):
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
     def skip(self, planes: int, outputs: int, channels: tuple[int, ...]) -> None:
-        """Encoder and decoder, as `tungsten_dip.fit.published.networks.Skip` with its defaults."""
+        """Encoder and decoder, as `tungsten_dip.fit.paper.networks.Skip` with its defaults."""
         scales = len(channels)
         sources, deeper = (planes, *channels[:-1]), (*channels[1:], channels[-1])
         x = self.mirrored("inputs", 2**scales, at_least=2 ** (scales + 1))
@@ -137,7 +137,7 @@ class _Network(GraphBuilder):
         self.cropped(self.add("Sigmoid", self.conv(x, "head", channels[0], outputs)))
 
     def resnet(self, planes: int, outputs: int) -> None:
-        """Residual blocks, as `tungsten_dip.fit.published.networks.ResNet` with its defaults."""
+        """Residual blocks, as `tungsten_dip.fit.paper.networks.ResNet` with its defaults."""
         width = RESNET_WIDTH
         x = self.padded(self.mirrored("inputs", 1, at_least=2), "reflect")
         x = self.leaky(self.conv(x, "first", planes, width, size=3))
@@ -198,7 +198,7 @@ class _Network(GraphBuilder):
         return self.add("Pad", x, self.integers(0, 0, 1, 1, 0, 0, 1, 1), mode=mode)
 
     def mirrored(self, x: str, multiple: int, at_least: int) -> str:
-        """Continue below and to the right, as `tungsten_dip.fit.published.networks.mirror_to_multiple`."""
+        """Continue below and to the right, as `tungsten_dip.fit.paper.networks.mirror_to_multiple`."""
         one = self.integers(1)
         for axis in (2, 3):
             size = self.add("Shape", x, start=axis, end=axis + 1)

@@ -17,9 +17,9 @@ from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.fusion import blends_all_samples
 from tungsten_dip.fit.model import Model, check_finite, check_planes
+from tungsten_dip.fit.paper.images import network_input, paper_images
 from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import completed, prepared
-from tungsten_dip.fit.published.images import network_input, paper_images
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves

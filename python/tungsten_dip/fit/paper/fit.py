@@ -18,10 +18,10 @@ from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
-from tungsten_dip.fit.published.constants import ITERATIONS
-from tungsten_dip.fit.published.device import compute_device, convolution_dtype
-from tungsten_dip.fit.published.images import PaperImages, network_input, paper_images
-from tungsten_dip.fit.published.networks import ResNet, Skip
+from tungsten_dip.fit.paper.constants import ITERATIONS
+from tungsten_dip.fit.paper.device import compute_device, convolution_dtype
+from tungsten_dip.fit.paper.images import PaperImages, network_input, paper_images
+from tungsten_dip.fit.paper.networks import ResNet, Skip
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress

@@ -19,7 +19,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from tungsten_dip import _core
-from tungsten_dip.fit.published.constants import (
+from tungsten_dip.fit.paper.constants import (
     LEAKY_SLOPE,
     NORM_EPSILON,
     RESNET_BLOCKS,
