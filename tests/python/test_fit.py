@@ -28,7 +28,7 @@ from tungsten_dip.fit.pilots import (
 )
 from tungsten_dip.fit.pointwise import Examples
 from tungsten_dip.fit.preparation import prepared
-from tungsten_dip.fit.surfaces import Guidance, guidance_of_halves
+from tungsten_dip.fit.surfaces import Surfaces, surfaces_of_halves
 from tungsten_dip.fit.training import Training, _batches
 
 
@@ -482,15 +482,15 @@ def test_inputs_stay_as_they_are(render: SyntheticRender) -> None:
             assert array.tobytes() == before[name, plane]
 
 
-def _guidance(buffers: RenderBuffers) -> tuple[Guidance, ...]:
+def _surfaces(buffers: RenderBuffers) -> tuple[Surfaces, ...]:
     half_a, half_b = buffers.color.half_a, buffers.color.half_b
     assert half_a is not None
     assert half_b is not None
-    return guidance_of_halves(buffers, (half_a, half_b), 1.0, 1)
+    return surfaces_of_halves(buffers, (half_a, half_b), 1.0, 1)
 
 
 def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) -> None:
-    assert [guidance.features.shape for guidance in _guidance(render.buffers)] == [(40, 56, 7)] * 2
+    assert [surfaces.features.shape for surfaces in _surfaces(render.buffers)] == [(40, 56, 7)] * 2
 
     def flattened(name: str, channels: list[int]) -> Buffer:
         planes = {}
@@ -502,18 +502,18 @@ def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) 
     buffers = render.buffers.with_quantities(
         albedo=flattened("albedo", [0, 1, 2]), normal=flattened("normal", [1]), depth=flattened("depth", [0])
     )
-    for guidance in _guidance(buffers):
-        assert guidance.features.shape == (40, 56, 2)
-        assert len(guidance.penalty) == 2
-        assert (np.ptp(guidance.features, axis=(0, 1)) > 0).all()
+    for surfaces in _surfaces(buffers):
+        assert surfaces.features.shape == (40, 56, 2)
+        assert len(surfaces.penalty) == 2
+        assert (np.ptp(surfaces.features, axis=(0, 1)) > 0).all()
     _check(denoise(buffers, _settings(iterations=2)), buffers)
     channels = {"albedo": [0, 1, 2], "normal": [0, 1, 2], "depth": [0]}
     nothing = render.buffers.with_quantities(**{name: flattened(name, of) for name, of in channels.items()})
-    assert [guidance.features.shape for guidance in _guidance(nothing)] == [(40, 56, 0)] * 2
+    assert [surfaces.features.shape for surfaces in _surfaces(nothing)] == [(40, 56, 0)] * 2
     _check(denoise(nothing, _settings(iterations=2)), nothing)
 
 
-def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: SyntheticRender) -> None:
+def test_surfaces_of_a_half_take_nothing_but_weights_from_the_other(render: SyntheticRender) -> None:
     """What a half's features share with the colour that scores it would pass for truth."""
 
     def darkened(half: str) -> RenderBuffers:
@@ -524,7 +524,7 @@ def test_guidance_of_a_half_takes_nothing_but_weights_from_the_other(render: Syn
         assert image is not None
         return render.buffers.with_quantities(albedo=replace(albedo, **{half: np.float32(0.98) * image}))
 
-    plain, changed = _guidance(render.buffers), _guidance(darkened("half_b"))
+    plain, changed = _surfaces(render.buffers), _surfaces(darkened("half_b"))
     assert np.abs(changed[1].albedo / plain[1].albedo - 1).mean() > 0.015
     assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.0025
 
@@ -541,8 +541,8 @@ def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None
         color = buffers.color
         assert color.half_a is not None
         assert color.half_b is not None
-        halves, guidance = (color.half_a, color.half_b), _guidance(buffers)
-        return PilotMaker(halves, guidance, first_guides(halves, guidance)).images(pilot)
+        halves, surfaces = (color.half_a, color.half_b), _surfaces(buffers)
+        return PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(pilot)
 
     features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
     noisy = render.buffers.with_quantities(**features)
@@ -589,7 +589,7 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
         return render.buffers.with_quantities(color=lit(render.buffers.color), albedo=lit(albedo))
 
     for halves, emission in ((("half_a",), [0.0, 0.0]), (("half_a", "half_b"), [30.0, 30.0])):
-        found = [g.emission[20, 30].mean() for g in _guidance(with_lamp(*halves))]
+        found = [s.emission[20, 30].mean() for s in _surfaces(with_lamp(*halves))]
         np.testing.assert_allclose(found, emission, rtol=0.05)
     image = denoise(with_lamp("half_a"), _settings(iterations=20)).color
     around = np.delete(image[18:23, 28:33].reshape(25, 3), 12, axis=0)

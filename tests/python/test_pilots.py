@@ -13,7 +13,7 @@ from tungsten_dip.fit.pilots import (
     PilotMaker,
     first_guides,
 )
-from tungsten_dip.fit.surfaces import Guidance, divisor, guidance_of_halves
+from tungsten_dip.fit.surfaces import Surfaces, divisor, surfaces_of_halves
 
 Plane = np.ndarray
 
@@ -26,36 +26,36 @@ def _buffer(half_a: FloatImage, half_b: FloatImage) -> Buffer:
     return Buffer((half_a + half_b) / 2, half_a, half_b)
 
 
-def _guidance(
+def _surfaces(
     emitted: tuple[Plane, Plane], seen: tuple[Plane, Plane] | None = None, wall: float = 0.5
-) -> tuple[Guidance, ...]:
-    """Return the guidance of a wall of radiance 0.3, and this albedo, before which light is emitted.
+) -> tuple[Surfaces, ...]:
+    """Return the surfaces of a wall of radiance 0.3, and this albedo, before which light is emitted.
 
     ``emitted`` is what the albedo holds of it, ``seen`` what the colour does (None: the same).
     """
     albedo = [_rgb(np.where(light > 0, 1 + light, wall)) for light in emitted]
     color_a, color_b = (_rgb(0.3 + light) for light in seen or emitted)
     buffers = RenderBuffers(_buffer(color_a, color_b), albedo=_buffer(*albedo))
-    return guidance_of_halves(buffers, (color_a, color_b), 1.0, 1)
+    return surfaces_of_halves(buffers, (color_a, color_b), 1.0, 1)
 
 
 def test_light_of_one_half_that_the_other_hardly_sees_is_stray() -> None:
     a, b = np.zeros((2, 20, 24))
     a[8, 9], b[9, 10] = 30, 0.05
-    for guidance, other in zip(_guidance((a, b)), (b, a), strict=True):
+    for surfaces, other in zip(_surfaces((a, b)), (b, a), strict=True):
         # At most four times the light of the other half's 5x5 pixels.
-        assert guidance.emission.max() <= 4 * other.max() + 1e-5
+        assert surfaces.emission.max() <= 4 * other.max() + 1e-5
     b[9, 10] = 20
-    assert _guidance((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
+    assert _surfaces((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
 
 
 def test_light_that_the_colour_does_not_hold_is_an_outlier() -> None:
     light = np.zeros((20, 24))
     light[8:12, 9:14] = 1000.0
-    for guidance in _guidance((light, light), (0 * light, 0 * light)):
-        assert guidance.emission.max() <= 0.3 + 1e-5
-    for guidance in _guidance((light, light)):
-        assert guidance.emission.max() == pytest.approx(1000, rel=1e-5)
+    for surfaces in _surfaces((light, light), (0 * light, 0 * light)):
+        assert surfaces.emission.max() <= 0.3 + 1e-5
+    for surfaces in _surfaces((light, light)):
+        assert surfaces.emission.max() == pytest.approx(1000, rel=1e-5)
 
 
 def _covered(angle: float, size: int = 48, subpixels: int = 16) -> Plane:
@@ -73,9 +73,9 @@ def test_the_rim_of_a_lamp_loses_most_of_its_noise(wall: float) -> None:
     for seed in range(3):
         rng, cover = np.random.default_rng(seed), _covered(angle=0.3)
         a, b = (30 * rng.binomial(4, cover) / 4 for _ in range(2))
-        for guidance in _guidance((a, b), wall=wall):
-            errors.append(np.mean((guidance.smooth_emission - _rgb(30 * cover)) ** 2))
-            noise.append(np.mean((guidance.emission - _rgb(30 * cover)) ** 2))
+        for surfaces in _surfaces((a, b), wall=wall):
+            errors.append(np.mean((surfaces.smooth_emission - _rgb(30 * cover)) ** 2))
+            noise.append(np.mean((surfaces.emission - _rgb(30 * cover)) ** 2))
     assert np.mean(errors) < 0.5 * np.mean(noise)
 
 
@@ -96,8 +96,8 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     surface = (columns >= 16) & (columns < 32)
     halves = _noisy(np.where(surface, 0.03, 0), shape=0.2)
     depth = Buffer(np.where(surface, 2, 0)[:, :, None].astype(np.float32))
-    guidance = guidance_of_halves(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
-    for image in PilotMaker(halves, guidance, first_guides(halves, guidance)).images(Pilot(6, k=1.0, step=2)):
+    surfaces = surfaces_of_halves(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
+    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(Pilot(6, k=1.0, step=2)):
         assert image[surface].mean() == pytest.approx(0.03, rel=0.1)
         assert image[~surface].max() < 1e-6
 
@@ -106,8 +106,8 @@ def test_the_previous_frame_guides_pilots_by_color() -> None:
     """It shows stripes of shadow that the noise hides."""
     truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
     halves, previous = _noisy(truth, shape=0.5), (_rgb(truth), _rgb(truth))
-    guidance = guidance_of_halves(RenderBuffers(_buffer(*halves)), halves, 1.0, 1)
-    alone = PilotMaker(halves, guidance, first_guides(halves, guidance))
+    surfaces = surfaces_of_halves(RenderBuffers(_buffer(*halves)), halves, 1.0, 1)
+    alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces))
     guided = replace(alone, previous=previous)
     errors = [
         np.mean((maker.images(Pilot(4, k=1.0, by_color=True))[0] - _rgb(truth)) ** 2)

@@ -30,7 +30,7 @@ from tungsten_dip.fit.pilots import (
 )
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
-from tungsten_dip.fit.surfaces import Guidance, alpha_as_albedo, guidance_of_halves
+from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, surfaces_of_halves
 from tungsten_dip.progress import Progress
 
 _NOISE_RADIUS = 8
@@ -121,7 +121,7 @@ def evidence_from_buffers(
     scale = exposure(buffers.color.mean)
     mean, limited = _without_fireflies(buffers.color, scale, threads)
     halves = limited.halves
-    guidance = guidance_of_halves(buffers, halves, scale, threads)
+    surfaces = surfaces_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
     candidates = [_scaled_halves(pair, scale) for pair in image.candidates]
     if settings.pilot == "oidn":
@@ -130,11 +130,11 @@ def evidence_from_buffers(
         candidates.append((a, b))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, guidance[0], len(candidates) + (previous is not None), image.drawn)
+        _check_fits(layout, surfaces[0], len(candidates) + (previous is not None), image.drawn)
 
     occupied = _occupied(halves, buffers, threads)
-    guides, known, filled = _guides(halves, guidance, previous, scale, occupied)
-    maker = PilotMaker(halves, guidance, guides, previous=filled)
+    guides, known, filled = _guides(halves, surfaces, previous, scale, occupied)
+    maker = PilotMaker(halves, surfaces, guides, previous=filled)
     budget = clock if layout is None else Clock()
     computed = _computed(maker, pilots, known, occupied, budget, progress)
     if filled is not None:
@@ -144,9 +144,9 @@ def evidence_from_buffers(
     denominators = _denominators(computed[-1])
     if layout is None:
         reference = _best(images, denominators)
-        layout = Layout(guidance[0].names, tuple(pilots[: len(computed)]), len(candidates), reference)
+        layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), reference)
     noises = _noises(_errors(images[layout.reference], halves, denominators), threads)
-    features = tuple({name: _feature(g, name) for name in layout.features} for g in guidance)
+    features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
     notes = _notes_on_features(buffers)
     if limited.note is not None:
         notes = (*notes, limited.note)
@@ -155,15 +155,15 @@ def evidence_from_buffers(
 
 def _guides(
     halves: Halves,
-    guidance: tuple[Guidance, ...],
+    surfaces: tuple[Surfaces, ...],
     previous: Halves | None,
     scale: float,
     occupied: FloatImage,
 ) -> tuple[Guides, dict[Pilot, Halves], Halves | None]:
     """Return the guides, pilots that are computed along with them, and the previous frame, filled."""
     if previous is None:
-        return first_guides(halves, guidance), {}, None
-    guides, first, filled = following_guides(halves, _scaled_halves(previous, scale), guidance)
+        return first_guides(halves, surfaces), {}, None
+    guides, first, filled = following_guides(halves, _scaled_halves(previous, scale), surfaces)
     return guides, {FOLLOWING_PILOTS[0]: _masked(first, occupied)}, _masked(filled, occupied)
 
 
@@ -223,12 +223,12 @@ def pilots_of_all_samples(
     if clock.share_spent() > _PILOTS_SHARE:
         return ()
     colors = (evidence.mean,)
-    guidance = guidance_of_halves(buffers, colors, evidence.scale, evidence.threads)
+    surfaces = surfaces_of_halves(buffers, colors, evidence.scale, evidence.threads)
     a, b = evidence.halves
     variance = np.float32(0.25) * (a - b) ** 2
-    guides = first_guides(colors, guidance, variance)
+    guides = first_guides(colors, surfaces, variance)
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
-    maker = PilotMaker(colors, guidance, guides, variance)
+    maker = PilotMaker(colors, surfaces, guides, variance)
     occupied = _occupied(evidence.halves, buffers, evidence.threads)
     pilots = evidence.layout.pilots
     computed = []
@@ -269,8 +269,8 @@ def _noises(errors_of_reference: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, guidance: Guidance, candidates: int, drawn: bool) -> None:
-    unknown = [n for n in layout.features if n not in guidance.names and n not in guidance.left_out]
+def _check_fits(layout: Layout, surfaces: Surfaces, candidates: int, drawn: bool) -> None:
+    unknown = [n for n in layout.features if n not in surfaces.names and n not in surfaces.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
@@ -288,10 +288,10 @@ def _check_fits(layout: Layout, guidance: Guidance, candidates: int, drawn: bool
         )
 
 
-def _feature(guidance: Guidance, name: str) -> FloatImage:
-    if name in guidance.names:
-        return guidance.features[:, :, guidance.names.index(name)]
-    return np.broadcast_to(np.float32(guidance.left_out[name]), guidance.features.shape[:2])
+def _feature(surfaces: Surfaces, name: str) -> FloatImage:
+    if name in surfaces.names:
+        return surfaces.features[:, :, surfaces.names.index(name)]
+    return np.broadcast_to(np.float32(surfaces.left_out[name]), surfaces.features.shape[:2])
 
 
 def _occupied(halves: Halves, buffers: RenderBuffers, threads: int) -> FloatImage:

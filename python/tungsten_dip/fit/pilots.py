@@ -16,7 +16,7 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.fit.layout import Pilot
-from tungsten_dip.fit.surfaces import EDGES_RADIUS, Guidance, along_edges
+from tungsten_dip.fit.surfaces import EDGES_RADIUS, Surfaces, along_edges
 
 _POSITION_SCALE_PIXELS = 20.0
 _GUIDE_OFFSET = 0.05
@@ -87,28 +87,28 @@ class Guides:
 
 
 def first_guides(
-    colors: tuple[FloatImage, ...], guidance: tuple[Guidance, ...], variance: FloatImage | None = None
+    colors: tuple[FloatImage, ...], surfaces: tuple[Surfaces, ...], variance: FloatImage | None = None
 ) -> Guides:
     """Return the guides of the two halves, or of the mean alone.
 
     The noise of guides is estimated from the difference of the halves' or, for the mean alone, from its
     ``variance`` (same shape).
     """
-    irradiances = tuple(g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
-    first = _FIRST_GUIDE if guidance[0].penalty else _FIRST_GUIDE_WITHOUT_FEATURES
+    irradiances = tuple(s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
+    first = _FIRST_GUIDE if surfaces[0].penalty else _FIRST_GUIDE_WITHOUT_FEATURES
     smooth = tuple(
-        np.maximum(_regress(image, first, g), 0) for image, g in zip(irradiances, guidance, strict=True)
+        np.maximum(_regress(image, first, s), 0) for image, s in zip(irradiances, surfaces, strict=True)
     )
-    guides = _guides(smooth, irradiances, guidance[0], variance)
+    guides = _guides(smooth, irradiances, surfaces[0], variance)
     smooth = tuple(
-        np.maximum(_regress(image, _SECOND_GUIDE, g, guide, guides.noise), 0)
-        for image, guide, g in zip(irradiances, guides.images, guidance, strict=True)
+        np.maximum(_regress(image, _SECOND_GUIDE, s, guide, guides.noise), 0)
+        for image, guide, s in zip(irradiances, guides.images, surfaces, strict=True)
     )
-    return _guides(smooth, irradiances, guidance[0], variance)
+    return _guides(smooth, irradiances, surfaces[0], variance)
 
 
 def following_guides(
-    colors: Halves, previous: Halves, guidance: tuple[Guidance, ...]
+    colors: Halves, previous: Halves, surfaces: tuple[Surfaces, ...]
 ) -> tuple[Guides, Halves, Halves]:
     """Return guides as `first_guides`, at a part of its cost.
 
@@ -116,21 +116,21 @@ def following_guides(
     no value. They are the guide, filled by the first of `FOLLOWING_PILOTS`. Returns (guides, first pilot,
     filled previous frame), the last two as linear radiance.
     """
-    irradiance_a, irradiance_b = (g.irradiance(color) for g, color in zip(guidance, colors, strict=True))
+    irradiance_a, irradiance_b = (s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
     irradiances = irradiance_a, irradiance_b
     first_a, first_b = (
-        g.color(_regress(image, FOLLOWING_PILOTS[0], g))
-        for image, g in zip(irradiances, guidance, strict=True)
+        s.color(_regress(image, FOLLOWING_PILOTS[0], s))
+        for image, s in zip(irradiances, surfaces, strict=True)
     )
     filled_a, filled_b = (
         np.where(np.isfinite(image), np.maximum(image, 0), first).astype(np.float32)
         for image, first in zip(previous, (first_a, first_b), strict=True)
     )
     smooth = tuple(
-        np.maximum((image - g.smooth_emission) / g.albedo, 0)
-        for image, g in zip((filled_a, filled_b), guidance, strict=True)
+        np.maximum((image - s.smooth_emission) / s.albedo, 0)
+        for image, s in zip((filled_a, filled_b), surfaces, strict=True)
     )
-    guides = _guides(smooth, irradiances, guidance[0])
+    guides = _guides(smooth, irradiances, surfaces[0])
     return guides, (first_a, first_b), (filled_a, filled_b)
 
 
@@ -142,7 +142,7 @@ class PilotMaker:
     """
 
     colors: tuple[FloatImage, ...]
-    guidance: tuple[Guidance, ...]
+    surfaces: tuple[Surfaces, ...]
     guides: Guides
     variance: FloatImage | None = None
     previous: Halves | None = None
@@ -151,27 +151,27 @@ class PilotMaker:
         """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
         if pilot.along_edges:
             return tuple(
-                along_edges(color, g.edges, pilot.radius, g.threads)
-                for color, g in zip(self.colors, self.guidance, strict=True)
+                along_edges(color, s.edges, pilot.radius, s.threads)
+                for color, s in zip(self.colors, self.surfaces, strict=True)
             )
-        guidance, guides = self._by_color if pilot.by_color else (self.guidance, self.guides)
+        surfaces, guides = self._by_color if pilot.by_color else (self.surfaces, self.guides)
         return tuple(
-            g.color(_regress(image, pilot, g, guide, guides.noise))
-            for image, guide, g in zip(guides.irradiances, guides.images, guidance, strict=True)
+            s.color(_regress(image, pilot, s, guide, guides.noise))
+            for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
         )
 
     @cached_property
-    def _by_color(self) -> tuple[tuple[Guidance, ...], Guides]:
-        guidance = tuple(g.without_features() for g in self.guidance)
+    def _by_color(self) -> tuple[tuple[Surfaces, ...], Guides]:
+        surfaces = tuple(s.without_features() for s in self.surfaces)
         if self.previous is not None:
-            return guidance, _guides(self.previous, self.colors, guidance[0])
-        return guidance, first_guides(self.colors, guidance, self.variance)
+            return surfaces, _guides(self.previous, self.colors, surfaces[0])
+        return surfaces, first_guides(self.colors, surfaces, self.variance)
 
 
 def _guides(
     images: tuple[FloatImage, ...],
     irradiances: tuple[FloatImage, ...],
-    guidance: Guidance,
+    surfaces: Surfaces,
     variance: FloatImage | None = None,
 ) -> Guides:
     guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
@@ -179,26 +179,26 @@ def _guides(
         noise = (guides[0] - guides[1]) ** 2 / 2
     else:
         assert variance is not None
-        squared = variance / guidance.albedo**2
+        squared = variance / surfaces.albedo**2
         noise = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
-    noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, guidance.threads)
+    noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, surfaces.threads)
     return Guides(guides, noise + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
 
 
 def _regress(
     image: FloatImage,
     pilot: Pilot,
-    guidance: Guidance,
+    surfaces: Surfaces,
     guide: FloatImage | None = None,
     guide_variance: FloatImage | None = None,
 ) -> FloatImage:
-    features, names, penalty = guidance.features, guidance.names, guidance.penalty
+    features, names, penalty = surfaces.features, surfaces.names, surfaces.penalty
     if pilot.with_position:
         features = np.concatenate((features, _positions(image.shape)), axis=2)
         names, penalty = (*names, "column", "row"), (*penalty, 0.0, 0.0)
     if pilot.k is None:
         return _core.regress(
-            image, features, penalty, radius=pilot.radius, step=pilot.step, threads=guidance.threads
+            image, features, penalty, radius=pilot.radius, step=pilot.step, threads=surfaces.threads
         )
     return _core.regress(
         image,
@@ -210,7 +210,7 @@ def _regress(
         radius=pilot.radius,
         step=pilot.step,
         k=pilot.k,
-        threads=guidance.threads,
+        threads=surfaces.threads,
     )
 
 

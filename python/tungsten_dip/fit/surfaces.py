@@ -43,8 +43,8 @@ _STRAY_RADIUS = 2
 
 
 @dataclass(frozen=True)
-class Guidance:
-    """What all pilots of one half share: the features to regress on, and how the colour is demodulated.
+class Surfaces:
+    """The surfaces as one half shows them: the features to regress on, and how the colour is demodulated.
 
     ``features`` (height, width, n) are pre-filtered and scaled, with one of ``names`` and one ``penalty``
     each. Features that are the same in every pixel are not among them; ``left_out`` maps their names to their
@@ -74,8 +74,8 @@ class Guidance:
         color: FloatImage = np.maximum(irradiance, 0) * self.albedo + self.smooth_emission
         return color
 
-    def without_features(self) -> Guidance:
-        """Return what pilots that see the colour alone share: its radiance is their irradiance."""
+    def without_features(self) -> Surfaces:
+        """Return nothing but the size of the image, for pilots that see the colour alone as irradiance."""
         nothing = np.zeros_like(self.emission)
         return replace(
             self,
@@ -88,13 +88,13 @@ class Guidance:
         )
 
 
-def guidance_of_halves(
+def surfaces_of_halves(
     buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
-) -> tuple[Guidance, ...]:
-    """Pre-filter, scale and select the features of sanitised buffers; return the guidance of every colour.
+) -> tuple[Surfaces, ...]:
+    """Pre-filter, scale and select the features of sanitised buffers; return the surfaces of every colour.
 
     ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
-    shape (height, width, 3). The guidance of a half is computed from its own samples alone (the other half
+    shape (height, width, 3). Those of a half are computed from its own samples alone (the other half
     only determines which of them are averaged), since errors that a half's features share with the colour
     that scores them would be mistaken for signal. Features without halves, and alpha, which has none, are the
     exception.
@@ -119,12 +119,12 @@ def guidance_of_halves(
         for name in planes_of_colors[0]
         if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_colors)
     ]
-    surfaces: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
+    albedo_pairs: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
     if filtered.albedo is not None:
-        surfaces = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
+        albedo_pairs = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
     return tuple(
-        _guidance(planes, flat, surface, color.shape, scale, threads)
-        for planes, surface, color in zip(planes_of_colors, surfaces, colors, strict=True)
+        _surfaces(planes, flat, albedo_pair, color.shape, scale, threads)
+        for planes, albedo_pair, color in zip(planes_of_colors, albedo_pairs, colors, strict=True)
     )
 
 
@@ -167,15 +167,15 @@ def _depth_scale(filtered: RenderBuffers) -> float:
     return float(np.median(hit)) if hit.size else 1.0
 
 
-def _guidance(
+def _surfaces(
     planes: dict[str, tuple[FloatImage, float]],
     flat: Sequence[str],
     albedos: tuple[FloatImage, FloatImage] | None,
     shape: tuple[int, ...],
     scale: float,
     threads: int,
-) -> Guidance:
-    """Return the guidance of one colour of this shape.
+) -> Surfaces:
+    """Return the surfaces as one colour of this shape shows them.
 
     ``planes`` are those of `_feature_planes`, of which those named by ``flat`` are left out. ``albedos`` is
     the albedo before and after pre-filtering, if there is one.
@@ -196,7 +196,7 @@ def _guidance(
         if emission.any():
             smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
     left_out = {name: float(planes[name][0][0, 0]) for name in flat}
-    return Guidance(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
+    return Surfaces(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
 
 
 def _smooth_emission(
@@ -237,11 +237,11 @@ def _feature_planes(
         albedo = _planes(filtered.albedo, count)[index]
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
-        surfaces = np.clip(albedo, 0, 1) + brightness
+        bounded = np.clip(albedo, 0, 1) + brightness
         if of_alpha:
-            scaled.append(("alpha", surfaces[:, :, :1], 3 * _ALBEDO_PENALTY))
+            scaled.append(("alpha", bounded[:, :, :1], 3 * _ALBEDO_PENALTY))
         else:
-            scaled.append(("albedo", surfaces, _ALBEDO_PENALTY))
+            scaled.append(("albedo", bounded, _ALBEDO_PENALTY))
     if filtered.normal is not None:
         normal = np.clip(_planes(filtered.normal, count)[index], -1, 1)
         scaled.append(("normal", normal, _NORMAL_PENALTY))
