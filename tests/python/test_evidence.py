@@ -12,8 +12,8 @@ from tungsten_dip.buffers.model import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
 from tungsten_dip.fit.evidence import Evidence, _noises
 from tungsten_dip.fit.exposure import unscaled
+from tungsten_dip.fit.inputs import loss_weights
 from tungsten_dip.fit.pilots import PilotMaker
-from tungsten_dip.fit.planes import loss_weights
 
 
 def test_guides_are_as_noisy_as_is_said_of_them(

@@ -407,7 +407,7 @@ def test_strands_before_nothing_are_found_by_alpha() -> None:
     assert 0.93 < result.color.mean() / truth.mean() < 1.07
     assert any("alpha takes the albedo's place" in note for note in result.notes)
     assert result.model is not None
-    assert result.model.planes[0] == "alpha.A"
+    assert result.model.inputs[0] == "alpha.A"
     hidden = denoise(RenderBuffers(noisy, alpha=np.ones_like(alpha)), draft)
     assert not any("alpha" in note for note in hidden.notes)
 

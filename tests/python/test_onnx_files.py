@@ -75,11 +75,11 @@ def test_every_model_survives_its_file(
 ) -> None:
     reference = data.draw(strategies.integers(1, len(pilots) + candidates))
     layout = Layout(tuple(features), tuple(pilots), candidates, reference)
-    planes = len(layout.planes)
-    constants = Standardisation(np.linspace(-9, 9, planes), np.full(planes, 0.3, np.float32))
+    inputs = len(layout.inputs)
+    constants = Standardisation(np.linspace(-9, 9, inputs), np.full(inputs, 0.3, np.float32))
     fit = Model(
         "pointwise",
-        layout.planes,
+        layout.inputs,
         first_weights(layout, seed, members),
         FitSettings("final", seed=seed),
         relmse,

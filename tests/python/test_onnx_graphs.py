@@ -82,12 +82,12 @@ def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, in
     assert model.standardisation is not None
     rng = np.random.default_rng(0)
     height, width = size
-    inputs = rng.normal(0, 2, (2, len(model.planes), height, width)).astype(np.float32)
+    inputs = rng.normal(0, 2, (2, len(model.inputs), height, width)).astype(np.float32)
     pilots = rng.random((2, model.layout.choices, 3, height, width), np.float32)
     color = session_of(model).run(None, {"inputs": inputs, "pilots": pilots})[0]
     assert color.shape == (2, 3, height, width)
 
-    flat = inputs.reshape(2, len(model.planes), -1).transpose(0, 2, 1).copy()
+    flat = inputs.reshape(2, len(model.inputs), -1).transpose(0, 2, 1).copy()
     model.standardisation.apply(flat, threads=1)
     choices = pilots.reshape(2, model.layout.choices, 3, -1).transpose(0, 3, 1, 2).copy()
     network = TorchNetwork(model.weights)
@@ -106,7 +106,7 @@ def test_skip_agrees_with_torch(
     from tungsten_dip.fit.paper.networks import Skip
 
     fit = paper_model("skip", frame.buffers, channels=channels)
-    network = Skip(len(fit.planes), 3, channels)
+    network = Skip(len(fit.inputs), 3, channels)
     check_paper(fit, network, size)
 
 
@@ -115,15 +115,15 @@ def test_resnet_agrees_with_torch(size: tuple[int, int], frame: SyntheticRender)
     from tungsten_dip.fit.paper.networks import ResNet
 
     fit = paper_model("resnet", frame.buffers, scheme="ioc")
-    assert fit.planes == ("random 0", "random 1", "random 2")
+    assert fit.inputs == ("random 0", "random 1", "random 2")
     outputs = fit.weights["last.bias"].size
     assert outputs > 3
-    check_paper(fit, ResNet(len(fit.planes), outputs), size)
+    check_paper(fit, ResNet(len(fit.inputs), outputs), size)
 
 
 def check_paper(fit: Model, network: Any, size: tuple[int, int]) -> None:
     network.load_state_dict({name: torch.from_numpy(weight) for name, weight in fit.weights.items()})
-    image = np.random.default_rng(1).random((1, len(fit.planes), *size), np.float32)
+    image = np.random.default_rng(1).random((1, len(fit.inputs), *size), np.float32)
     with torch.no_grad():
         expected = network(torch.from_numpy(image)).numpy()
     np.testing.assert_allclose(session_of(fit).run(None, {"inputs": image})[0], expected, rtol=1e-4)
@@ -136,7 +136,7 @@ def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None
 
     fit = paper_model("skip", frame.buffers)
     result = infer(fit, frame.buffers, threads=1)
-    network = Skip(len(fit.planes), 3, fit.settings.channels)
+    network = Skip(len(fit.inputs), 3, fit.settings.channels)
     network.load_state_dict({name: torch.from_numpy(weight) for name, weight in fit.weights.items()})
     from tungsten_dip.buffers.sanitize import sanitize
 
@@ -149,18 +149,18 @@ def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None
         infer(fit, frame.buffers, refit_steps=1)
 
 
-def test_a_plane_that_varies_little_around_a_large_mean_keeps_its_digits() -> None:
+def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> None:
     layout = Layout(("depth.Z",), (Pilot(1),), 0, 1)
-    planes = len(layout.planes)
+    inputs = len(layout.inputs)
     rng = np.random.default_rng(0)
-    raw = np.full((2, planes, 6, 7), 1e4, np.float32)
+    raw = np.full((2, inputs, 6, 7), 1e4, np.float32)
     raw += rng.integers(-9, 9, raw.shape).astype(np.float32) / 256
-    flat = raw.reshape(2, planes, -1).transpose(0, 2, 1).copy()
-    mean = np.full(planes, 1e4 + 1e-5)
-    standardisation = Standardisation(mean, np.full(planes, 0.02, np.float32))
+    flat = raw.reshape(2, inputs, -1).transpose(0, 2, 1).copy()
+    mean = np.full(inputs, 1e4 + 1e-5)
+    standardisation = Standardisation(mean, np.full(inputs, 0.02, np.float32))
     weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
-    fit = Model("pointwise", layout.planes, weights, FitSettings(), None, "", layout, standardisation)
+    fit = Model("pointwise", layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
     pilots = rng.random((2, 2, 3, 6, 7), np.float32)
     color = session_of(fit).run(None, {"inputs": raw, "pilots": pilots})[0]
     standardisation.apply(flat, threads=1)

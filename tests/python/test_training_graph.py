@@ -12,9 +12,9 @@ import pytest
 from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.fit import denoise
+from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, network_inputs
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.planes import PLANES_RADIUS, network_inputs, planes_of_half
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights, training_step, weight_shapes
 from tungsten_dip.fit.training import start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -40,8 +40,8 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     batch = examples.at(rng.integers(2 * 480, size=pixels))
 
     in_torch = TorchNetwork(weights)
-    in_onnx = PointwiseNetwork(weights, len(layout.planes), layout.choices, "cpu")
-    proto = training_step(len(layout.planes), layout.choices)
+    in_onnx = PointwiseNetwork(weights, len(layout.inputs), layout.choices, "cpu")
+    proto = training_step(len(layout.inputs), layout.choices)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
     feeds = {
@@ -72,7 +72,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
 def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
-    sizes = len(layout.planes), layout.choices
+    sizes = len(layout.inputs), layout.choices
     together = PointwiseNetwork(weights, *sizes, "cpu", threads=2)
     parts = {name: np.split(value, 3) for name, value in weights.items()}
     alone = [
@@ -91,11 +91,11 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
 def test_gradients_are_those_of_the_loss() -> None:
     """Against central differences in double precision, without torch."""
     rng = np.random.default_rng(0)
-    planes, choices, pixels = 3, 2, 5
-    shapes = weight_shapes(planes, choices)
+    inputs, choices, pixels = 3, 2, 5
+    shapes = weight_shapes(inputs, choices)
     vector = rng.normal(0, 0.5, sum(int(np.prod(s)) for s in shapes.values()))
     feeds = {
-        "inputs": rng.normal(size=(pixels, planes)),
+        "inputs": rng.normal(size=(pixels, inputs)),
         "pilots": rng.random((pixels, choices, 3)),
         "target": rng.random((pixels, 3)),
         "weight": rng.random((pixels, 1)),
@@ -120,7 +120,7 @@ def test_gradients_are_those_of_the_loss() -> None:
     single = {name: value.astype(np.float32) for name, value in {**feeds, "weights": vector}.items()}
     one = np.ones(1, np.float32)
     state = {"mean": zeros, "square": zeros, "learning_rate": one, "step": one}
-    gradient = session_from_proto(training_step(planes, choices), 1).run(["gradient"], {**single, **state})[0]
+    gradient = session_from_proto(training_step(inputs, choices), 1).run(["gradient"], {**single, **state})[0]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -141,7 +141,7 @@ def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
     whole = network_inputs(evidence).reshape(2, 32, 48, -1)
     upper = network_inputs(evidence.rows(0, 28)).reshape(2, 28, 48, -1)
     lower = network_inputs(evidence.rows(4, 32)).reshape(2, 28, 48, -1)
-    inner = 28 - PLANES_RADIUS
+    inner = 28 - INPUTS_RADIUS
     np.testing.assert_allclose(upper[:, :inner], whole[:, :inner], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(lower[:, -inner:], whole[:, -inner:], rtol=1e-3, atol=1e-3)
 
@@ -154,6 +154,6 @@ def test_the_network_sees_the_noise_of_no_pixel_at_that_pixel(changed: str, fram
     noisy = [image.copy() for image in evidence.halves]
     noisy[half if changed == "seen" else 1 - half][y, x] *= 3
     other = replace(evidence, pilots=((noisy[0], noisy[1]), *evidence.pilots[1:]))
-    before, after = (np.stack(list(planes_of_half(e, half)), axis=2) for e in (evidence, other))
+    before, after = (np.stack(list(inputs_of_half(e, half)), axis=2) for e in (evidence, other))
     np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
     assert np.abs(after - before).max() > 0.01

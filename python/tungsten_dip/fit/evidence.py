@@ -91,7 +91,7 @@ class Evidence:
             self,
             mean=self.mean[first:end],
             features=tuple(
-                {name: plane[first:end] for name, plane in features.items()} for features in self.features
+                {name: image[first:end] for name, image in features.items()} for features in self.features
             ),
             pilots=tuple(cut(pilot) for pilot in self.pilots),
             noises=cut(self.noises),

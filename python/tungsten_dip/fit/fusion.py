@@ -1,6 +1,6 @@
 """The presets draft, balanced and final: a small network chooses among pilots, trained across the halves.
 
-The network's inputs are the planes (`planes`) of one pixel of one half. It outputs the weights of a mean of
+The network's inputs (`inputs`) are those of one pixel of one half. It outputs the weights of a mean of
 the pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". The noise of
 the other half is independent: it adds a constant to the loss and does not enter the image, whose mean is
 preserved.
@@ -92,7 +92,7 @@ def fit_fusion(
     evidence = start.evidence
     network = PointwiseNetwork(
         start.weights,
-        len(evidence.layout.planes),
+        len(evidence.layout.inputs),
         evidence.layout.choices,
         settings.device,
         evidence.threads,
@@ -114,7 +114,7 @@ def fit_fusion(
         halves_drawn=halved.drawn,
         model=Model(
             kind="pointwise",
-            planes=evidence.layout.planes,
+            inputs=evidence.layout.inputs,
             weights=network.weights(),
             settings=settings,
             estimated_relmse=image.estimated_relmse,

@@ -52,8 +52,8 @@ class Layout:
         return len(self.pilots)
 
     @property
-    def planes(self) -> tuple[str, ...]:
-        """The names of what `planes_of_half` yields, in its order."""
+    def inputs(self) -> tuple[str, ...]:
+        """The names of what `inputs_of_half` yields, in its order."""
         return (
             *self.features,
             "noise",

@@ -31,13 +31,13 @@ class Model:
     fitted to. The others are the networks of the preset paper, which give the image themselves; for them
     ``layout`` and ``standardisation`` are None.
 
-    ``planes`` names the network's inputs in order. ``estimated_relmse`` is the error of the fit's result.
+    ``inputs`` names the network's inputs in order. ``estimated_relmse`` is the error of the fit's result.
     ``source_sha256`` is the SHA-256 of the colour that the network was fitted to (float32, row by row),
     ``version`` that of this package.
     """
 
     kind: Kind
-    planes: tuple[str, ...]
+    inputs: tuple[str, ...]
     weights: Weights
     settings: FitSettings
     estimated_relmse: float | None
@@ -64,16 +64,16 @@ def check_settings(model: Model, settings: FitSettings) -> None:
             )
 
 
-def check_planes(model: Model, planes: tuple[str, ...]) -> None:
-    """Raise InputError that names the difference if an image's planes are not the model's inputs."""
-    if planes == model.planes:
+def check_inputs(model: Model, inputs: tuple[str, ...]) -> None:
+    """Raise InputError that names the difference if an image's inputs are not the model's."""
+    if inputs == model.inputs:
         return
-    missing = [name for name in model.planes if name not in planes]
-    unknown = [name for name in planes if name not in model.planes]
+    missing = [name for name in model.inputs if name not in inputs]
+    unknown = [name for name in inputs if name not in model.inputs]
     differences = [
         f"{verb} {', '.join(names)}" for verb, names in (("lacks", missing), ("adds", unknown)) if names
     ]
-    what = " and ".join(differences) or "has the planes in another order"
+    what = " and ".join(differences) or "has the inputs in another order"
     raise InputError(
         f"the input does not fit the model: it {what}; render the same buffers, or fit without the model"
     )

@@ -41,7 +41,7 @@ _RUN_PIXELS = 1 << 14
 class Examples:
     """What a network is trained on: pixels of an image, those of half A first, or some of them.
 
-    ``inputs`` has shape (pixels, planes), ``pilots`` (pixels, pilots, 3), ``target``, the other half's
+    ``inputs`` has shape (pixels, inputs), ``pilots`` (pixels, pilots, 3), ``target``, the other half's
     colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
@@ -67,21 +67,21 @@ class Examples:
         return self.inputs, self.pilots, self.target, self.weight
 
 
-def training_step(planes: int, choices: int) -> onnx.ModelProto:
+def training_step(inputs: int, choices: int) -> onnx.ModelProto:
     """Return the graph of one step.
 
-    Inputs: ``inputs`` (M, planes), standardised, ``pilots`` (M, pilots, 3), ``target`` (M, 3) and ``weight``
+    Inputs: ``inputs`` (M, inputs), standardised, ``pilots`` (M, pilots, 3), ``target`` (M, 3) and ``weight``
     (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square``
     (Adam's moments) and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs:
     ``loss``, the vector ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
     """
     build = _Step()
-    shapes = weight_shapes(planes, choices)
+    shapes = weight_shapes(inputs, choices)
     size = sum(int(np.prod(shape)) for shape in shapes.values())
     gradient = build.gradient(shapes)
     build.adam(gradient)
     pixels: dict[str, tuple[int | str, ...]] = {
-        "inputs": ("M", planes),
+        "inputs": ("M", inputs),
         "pilots": ("M", choices, 3),
         "target": ("M", 3),
         "weight": ("M", 1),
@@ -92,9 +92,9 @@ def training_step(planes: int, choices: int) -> onnx.ModelProto:
     return build.model("training_step", {**pixels, **vectors, **numbers}, given)
 
 
-def weight_shapes(planes: int, choices: int) -> dict[str, tuple[int, ...]]:
+def weight_shapes(inputs: int, choices: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of one member's weights, in the order of the vectors of `training_step`."""
-    sizes = (planes, HIDDEN, HIDDEN, choices)
+    sizes = (inputs, HIDDEN, HIDDEN, choices)
     shapes: dict[str, tuple[int, ...]] = {}
     for layer in (1, 2, 3):
         shapes[f"layer{layer}.weight"] = (sizes[layer], sizes[layer - 1])
@@ -106,7 +106,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
     """Return the weights that untrained members start from (He et al. 2015, uniform)."""
     rng = np.random.default_rng(seed)
     weights: Weights = {}
-    for name, (outputs, *inputs) in weight_shapes(len(layout.planes), layout.choices).items():
+    for name, (outputs, *inputs) in weight_shapes(len(layout.inputs), layout.choices).items():
         if inputs:
             bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs[0]))
             shape = (members * outputs, *inputs, 1, 1)
@@ -126,12 +126,12 @@ _Member = dict[str, FloatArray]
 class PointwiseNetwork:
     """The members of a network and the states of their optimisers; each keeps one of ``threads`` busy."""
 
-    def __init__(self, weights: Weights, planes: int, choices: int, device: Device, threads: int = 1) -> None:
+    def __init__(self, weights: Weights, inputs: int, choices: int, device: Device, threads: int = 1) -> None:
         self._threads = threads
-        self._shapes = weight_shapes(planes, choices)
+        self._shapes = weight_shapes(inputs, choices)
         # The network is too small to share: threads would only wait for one another.
-        self._step = session_from_proto(training_step(planes, choices), 1, device)
-        self._fuse = session_from_proto(_forward(planes, choices), 1, device)
+        self._step = session_from_proto(training_step(inputs, choices), 1, device)
+        self._fuse = session_from_proto(_forward(inputs, choices), 1, device)
         self._steps_done = 0
         self._members = self._states(weights)
 
@@ -206,17 +206,17 @@ def members_of(weights: Weights) -> int:
     return max(np.size(weights.get("layer1.bias", ())) // HIDDEN, 1)
 
 
-def _forward(planes: int, choices: int) -> onnx.ModelProto:
+def _forward(inputs: int, choices: int) -> onnx.ModelProto:
     """Return the graph of `PointwiseNetwork.fuse`."""
     build = _Step()
-    shapes = weight_shapes(planes, choices)
+    shapes = weight_shapes(inputs, choices)
     build.add("Transpose", build.forward(shapes)["mixed"], perm=[1, 0], output="fused")
-    inputs: dict[str, tuple[int | str, ...]] = {
-        "inputs": ("M", planes),
+    given: dict[str, tuple[int | str, ...]] = {
+        "inputs": ("M", inputs),
         "pilots": ("M", choices, 3),
         "weights": (sum(int(np.prod(shape)) for shape in shapes.values()),),
     }
-    return build.model("forward", inputs, {"fused": ("M", 3)})
+    return build.model("forward", given, {"fused": ("M", 3)})
 
 
 class _Step(GraphBuilder):

@@ -19,13 +19,13 @@ _PART_PIXELS = 1 << 11
 
 @dataclass(frozen=True)
 class Standardisation:
-    """Brings every plane to mean 0 and standard deviation 1 on the image that it was made for."""
+    """Brings every input to mean 0 and standard deviation 1 on the image that it was made for."""
 
     mean: npt.NDArray[np.float64]
     std: FloatArray
 
     def apply(self, inputs: FloatArray, threads: int) -> None:
-        """Standardise planes in place, shape (2, pixels, planes), clipped to 4 standard deviations."""
+        """Standardise inputs in place, shape (2, pixels, inputs), clipped to 4 standard deviations."""
 
         def standardise(half: int) -> None:
             for part in _parts(inputs[half]):
@@ -41,7 +41,7 @@ class Standardisation:
 
 
 def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
-    """Return mean and standard deviation of every plane of shape (2, pixels, planes)."""
+    """Return mean and standard deviation of every input, which have the shape (2, pixels, inputs)."""
     count = inputs.shape[0] * inputs.shape[1]
 
     def sums(half: int) -> Any:
@@ -55,7 +55,7 @@ def standardisation_of(inputs: FloatArray, threads: int) -> Standardisation:
     return Standardisation(mean, np.maximum(np.sqrt(variance), _LEAST_SPREAD).astype(np.float32))
 
 
-def _parts(planes: FloatArray) -> Iterator[FloatArray]:
-    """Yield some pixels after the other, all planes of them: views that fit the processor's cache."""
-    for first in range(0, len(planes), _PART_PIXELS):
-        yield planes[first : first + _PART_PIXELS]
+def _parts(inputs: FloatArray) -> Iterator[FloatArray]:
+    """Yield some pixels after the other, all inputs of them: views that fit the processor's cache."""
+    for first in range(0, len(inputs), _PART_PIXELS):
+        yield inputs[first : first + _PART_PIXELS]

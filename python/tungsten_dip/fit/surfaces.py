@@ -110,21 +110,21 @@ def surfaces_of_halves(
         buffers = replace(buffers, albedo=_with_planes(rendered, albedos))
     filtered = prefilter_features(buffers, threads)
     depth_scale = _depth_scale(filtered)
-    planes_of_colors = [
-        _feature_planes(filtered, index, count, depth_scale, of_alpha=alpha is not None)
+    channels_of_colors = [
+        _feature_channels(filtered, index, count, depth_scale, of_alpha=alpha is not None)
         for index in range(count)
     ]
     flat = [
         name
-        for name in planes_of_colors[0]
-        if all(np.ptp(planes[name][0]) == 0 for planes in planes_of_colors)
+        for name in channels_of_colors[0]
+        if all(np.ptp(channels[name][0]) == 0 for channels in channels_of_colors)
     ]
     albedo_pairs: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
     if filtered.albedo is not None:
         albedo_pairs = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
     return tuple(
-        _surfaces(planes, flat, albedo_pair, color.shape, scale, threads)
-        for planes, albedo_pair, color in zip(planes_of_colors, albedo_pairs, colors, strict=True)
+        _surfaces(channels, flat, albedo_pair, color.shape, scale, threads)
+        for channels, albedo_pair, color in zip(channels_of_colors, albedo_pairs, colors, strict=True)
     )
 
 
@@ -168,23 +168,23 @@ def _depth_scale(filtered: RenderBuffers) -> float:
 
 
 def _surfaces(
-    planes: dict[str, tuple[FloatImage, float]],
+    channels: dict[str, tuple[FloatImage, float]],
     flat: Sequence[str],
     albedos: tuple[FloatImage, FloatImage] | None,
     shape: tuple[int, ...],
     scale: float,
     threads: int,
 ) -> Surfaces:
-    """Return the surfaces as one colour of this shape shows them.
+    """Return the surfaces of one colour of this shape.
 
-    ``planes`` are those of `_feature_planes`, of which those named by ``flat`` are left out. ``albedos`` is
-    the albedo before and after pre-filtering, if there is one.
+    ``channels`` are those of `_feature_channels`, of which those named by ``flat`` are left out. ``albedos``
+    is the albedo before and after pre-filtering, if there is one.
     """
-    kept = tuple(name for name in planes if name not in flat)
+    kept = tuple(name for name in channels if name not in flat)
     features = np.empty((*shape[:2], len(kept)), np.float32)
     for index, name in enumerate(kept):
-        features[:, :, index] = planes[name][0]
-    penalty = tuple(planes[name][1] for name in kept)
+        features[:, :, index] = channels[name][0]
+    penalty = tuple(channels[name][1] for name in kept)
     edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
     albedo = np.ones(shape, np.float32)
     emission = smooth_emission = np.zeros(shape, np.float32)
@@ -195,7 +195,7 @@ def _surfaces(
         smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
         if emission.any():
             smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
-    left_out = {name: float(planes[name][0][0, 0]) for name in flat}
+    left_out = {name: float(channels[name][0][0, 0]) for name in flat}
     return Surfaces(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
 
 
@@ -225,7 +225,7 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
 
 
-def _feature_planes(
+def _feature_channels(
     filtered: RenderBuffers, index: int, count: int, depth_scale: float, of_alpha: bool
 ) -> dict[str, tuple[FloatImage, float]]:
     """Return every channel of the features of one of ``count`` colours, scaled, and its penalty.

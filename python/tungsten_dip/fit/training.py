@@ -13,11 +13,11 @@ from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error
 from tungsten_dip.fit.evidence import Evidence, with_best_reference
-from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.planes import (
+from tungsten_dip.fit.inputs import (
     loss_weights,
     network_inputs,
 )
+from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
@@ -44,7 +44,7 @@ _PROBE_SHARE = 8
 """One pixel in this many at most is set aside."""
 
 _STRANGE = 0.5
-"""A model is not used on an image of which more than this part of a plane is clipped at `LARGEST_INPUT`."""
+"""A model is not used on an image of which more than this part of an input is clipped at `LARGEST_INPUT`."""
 
 _WARM_RATE = 0.3
 """A network that starts near its goal takes steps this many times as long."""
@@ -76,7 +76,7 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None, member
     notes: tuple[str, ...] = ()
     if model is not None and model.standardisation is not None:
         model.standardisation.apply(inputs, evidence.threads)
-        far_out = [float((np.abs(plane) >= LARGEST_INPUT).mean()) for plane in np.moveaxis(inputs, 2, 0)]
+        far_out = [float((np.abs(image) >= LARGEST_INPUT).mean()) for image in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
             return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
         notes = ("the image is too unlike the model's: a new network is fitted",)

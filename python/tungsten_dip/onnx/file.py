@@ -34,7 +34,7 @@ LARGEST_STRUCTURE_BYTES = 1 << 20
 """Of all but the weights: bounds the memory of the parser."""
 
 _FORMAT = 3
-"""Raised whenever another graph is written, or the same one has other planes as inputs."""
+"""Raised whenever another graph is written, or the same one has other inputs."""
 
 _PROPERTY = "tungsten_dip"
 _SETTINGS = ("preset", "pilot", "iterations", "network", "inputs", "scheme", "channels", "seed")
@@ -96,7 +96,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         "format": _FORMAT,
         "version": model.version,
         "kind": model.kind,
-        "planes": model.planes,
+        "planes": model.inputs,
         "settings": {name: getattr(model.settings, name) for name in _SETTINGS},
         "estimated_relmse": model.estimated_relmse,
         "source_sha256": model.source_sha256,
@@ -202,13 +202,13 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
     hints = get_type_hints(FitSettings)
     settings = FitSettings(**{name: _checked(name, chosen.get(name), hints[name]) for name in _SETTINGS})
     relmse = _checked("estimated_relmse", facts.get("estimated_relmse"), float | None)
-    planes = _checked("planes", facts.get("planes"), tuple[str, ...])
+    inputs = _checked("planes", facts.get("planes"), tuple[str, ...])
     version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))
     layout = standardisation = None
     if kind == "pointwise":
         layout = _layout(_object("layout", facts.get("layout")))
-        if layout.planes != planes:
-            raise InputError("the planes are not those of the pilots; this version has other names for them")
+        if layout.inputs != inputs:
+            raise InputError("the inputs are not those of the pilots; this version has other names for them")
         mean, std = (_array(tensors.pop(n, None), n, dtype) for n, dtype in (("mean", "f8"), ("std", "f4")))
         if not (std > 0).all():
             raise InputError("std: expected numbers above 0")
@@ -223,7 +223,7 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
         for name, tensor in tensors.items()
         if name.endswith((".weight", ".bias"))
     }
-    return Model(kind, planes, weights, settings, relmse, source, layout, standardisation, version)
+    return Model(kind, inputs, weights, settings, relmse, source, layout, standardisation, version)
 
 
 def _layout(facts: dict[str, Any]) -> Layout:

@@ -35,31 +35,31 @@ _MOST_MEMBERS = 16
 def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.ModelProto:
     """Return the model's network with its weights.
 
-    Pointwise: ``inputs`` (N, planes, H, W), as they come, and ``pilots`` (N, pilots, 3, H, W) give ``color``
-    (N, 3, H, W). Others: ``inputs`` (N, planes, H, W) give ``color`` (N, outputs, H, W), colour first.
+    Pointwise: ``inputs`` (N, inputs, H, W), as they come, and ``pilots`` (N, pilots, 3, H, W) give ``color``
+    (N, 3, H, W). Others: ``inputs`` (N, inputs, H, W) give ``color`` (N, outputs, H, W), colour first.
 
     Raises InputError if the model's weights are not those of its network.
     """
     build = _Network(model.weights)
-    planes: int = len(model.planes)
-    inputs: dict[str, tuple[int | str, ...]] = {"inputs": ("N", planes, "H", "W")}
+    inputs = len(model.inputs)
+    shapes: dict[str, tuple[int | str, ...]] = {"inputs": ("N", inputs, "H", "W")}
     outputs = 3
     if model.layout is not None and model.standardisation is not None:
-        inputs["pilots"] = ("N", model.layout.choices, 3, "H", "W")
+        shapes["pilots"] = ("N", model.layout.choices, 3, "H", "W")
         mean, std = model.standardisation.mean, model.standardisation.std
-        if not mean.shape == std.shape == (planes,):
-            raise InputError(f"the model has constants for {mean.size} planes, and {planes} planes")
-        build.pointwise(planes, model.layout.choices, mean, std)
+        if not mean.shape == std.shape == (inputs,):
+            raise InputError(f"the model has constants for {mean.size} inputs, and {inputs} inputs")
+        build.pointwise(inputs, model.layout.choices, mean, std)
     else:
         name = "head.bias" if model.kind == "skip" else "last.bias"
         outputs = model.weights[name].size if name in model.weights else 3
         if model.kind == "skip":
-            build.skip(planes, outputs, model.settings.channels)
+            build.skip(inputs, outputs, model.settings.channels)
         else:
-            build.resnet(planes, outputs)
+            build.resnet(inputs, outputs)
     build.check_all_used()
     return build.model(
-        model.kind, inputs, {"color": ("N", outputs, "H", "W")}, metadata, version=model.version
+        model.kind, shapes, {"color": ("N", outputs, "H", "W")}, metadata, version=model.version
     )
 
 
@@ -72,10 +72,10 @@ class _Network(GraphBuilder):
         self._used: set[str] = set()
 
     def pointwise(
-        self, planes: int, choices: int, mean: npt.NDArray[np.float64], std: npt.NDArray[np.float32]
+        self, inputs: int, choices: int, mean: npt.NDArray[np.float64], std: npt.NDArray[np.float32]
     ) -> None:
         """Standardise, choose among the pilots, mix them."""
-        # In double precision, as in the fit: a plane may vary by little around a large mean.
+        # In double precision, as in the fit: an input may vary by little around a large mean.
         exact = self.add("Cast", "inputs", to=TensorProto.DOUBLE)
         centred = self.add("Sub", exact, self.constant("mean", mean.reshape(-1, 1, 1)))
         centred = self.add("Cast", centred, to=TensorProto.FLOAT)
@@ -85,7 +85,7 @@ class _Network(GraphBuilder):
         if members > _MOST_MEMBERS:
             raise InputError(f"the model has {members} members: expected at most {_MOST_MEMBERS}")
         hidden = members * HIDDEN
-        x = self.leaky(self.conv(x, "layer1", planes, hidden), POINTWISE_SLOPE)
+        x = self.leaky(self.conv(x, "layer1", inputs, hidden), POINTWISE_SLOPE)
         x = self.leaky(self.conv(x, "layer2", hidden, hidden, groups=members), POINTWISE_SLOPE)
         x = self.conv(x, "layer3", hidden, members * choices, groups=members)
         if members == 1:
@@ -96,10 +96,10 @@ class _Network(GraphBuilder):
         mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "pilots")
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
-    def skip(self, planes: int, outputs: int, channels: tuple[int, ...]) -> None:
+    def skip(self, inputs: int, outputs: int, channels: tuple[int, ...]) -> None:
         """Encoder and decoder, as `tungsten_dip.fit.paper.networks.Skip` with its defaults."""
         scales = len(channels)
-        sources, deeper = (planes, *channels[:-1]), (*channels[1:], channels[-1])
+        sources, deeper = (inputs, *channels[:-1]), (*channels[1:], channels[-1])
         x = self.mirrored("inputs", 2**scales, at_least=2 ** (scales + 1))
         sides: list[str | None] = []
         for scale, (before, after) in enumerate(zip(sources, channels, strict=True)):
@@ -136,11 +136,11 @@ class _Network(GraphBuilder):
             x = self.norm_act(x, f"{up}.blend.2", after)
         self.cropped(self.add("Sigmoid", self.conv(x, "head", channels[0], outputs)))
 
-    def resnet(self, planes: int, outputs: int) -> None:
+    def resnet(self, inputs: int, outputs: int) -> None:
         """Residual blocks, as `tungsten_dip.fit.paper.networks.ResNet` with its defaults."""
         width = RESNET_WIDTH
         x = self.padded(self.mirrored("inputs", 1, at_least=2), "reflect")
-        x = self.leaky(self.conv(x, "first", planes, width, size=3))
+        x = self.leaky(self.conv(x, "first", inputs, width, size=3))
         for block in (f"blocks.{index}" for index in range(RESNET_BLOCKS)):
             y = self.conv(self.padded(x, "constant"), f"{block}.0", width, width, size=3, bias=False)
             y = self.padded(self.norm_act(y, f"{block}.1", width), "constant")

@@ -16,9 +16,9 @@ from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.fusion import blends_all_samples
-from tungsten_dip.fit.model import Model, check_finite, check_planes
+from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half
+from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
-from tungsten_dip.fit.planes import PLANES_RADIUS, planes_of_half
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
@@ -136,19 +136,19 @@ def _fused(
         if whole_pilots:
             choices.append(list(whole_pilots))
         fused = tuple(np.empty_like(evidence.mean) for _ in choices)
-        inputs = np.empty((len(model.planes), min(rows, height), width), np.float32)
+        inputs = np.empty((len(model.inputs), min(rows, height), width), np.float32)
         for first in range(0, height, rows):
             end = min(first + rows, height)
-            # The planes of a row come from the rows around it.
-            above, below = max(first - PLANES_RADIUS, 0), min(end + PLANES_RADIUS, height)
-            for index, plane in enumerate(planes_of_half(evidence.rows(above, below), half)):
-                inputs[index, : end - first] = plane[first - above : end - above]
+            # The inputs of a row come from the rows around it.
+            above, below = max(first - INPUTS_RADIUS, 0), min(end + INPUTS_RADIUS, height)
+            for index, image in enumerate(inputs_of_half(evidence.rows(above, below), half)):
+                inputs[index, : end - first] = image[first - above : end - above]
             for row in range(first, end, rows_at_once):
                 part = slice(row, min(row + rows_at_once, end))
-                planes = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
+                some = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
                 for image, images in zip(fused, choices, strict=True):
                     pilots = np.stack([pilot[part].transpose(2, 0, 1) for pilot in images])[None]
-                    color = session.run(["color"], {"inputs": planes, "pilots": pilots})[0]
+                    color = session.run(["color"], {"inputs": some, "pilots": pilots})[0]
                     check_finite(color)
                     image[part] = color[0].transpose(1, 2, 0)
         return fused
@@ -163,7 +163,7 @@ def _infer_paper(
 ) -> FitResult:
     clock = Clock()
     images = paper_images(buffers, settings)
-    check_planes(model, images.planes)
+    check_inputs(model, images.inputs)
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
     # Norms of the whole image: no bands here.
     session = session_from_proto(graph_of(model), thread_count(settings.threads))

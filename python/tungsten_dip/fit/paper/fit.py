@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.model import Model, Weights, check_planes, source_sha256
+from tungsten_dip.fit.model import Model, Weights, check_inputs, source_sha256
 from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.paper.device import compute_device, convolution_dtype
 from tungsten_dip.fit.paper.images import PaperImages, network_input, paper_images
@@ -158,7 +158,7 @@ def fit_paper(
     clock = Clock(settings.time_budget_s)
     images = paper_images(buffers, settings)
     if warm_start is not None:
-        check_planes(warm_start, images.planes)
+        check_inputs(warm_start, images.inputs)
     total = settings.iterations or ITERATIONS
     notes = [*_notes_on_method(buffers, settings), *images.notes]
     history = []
@@ -188,7 +188,7 @@ def fit_paper(
             if iteration < total:
                 notes.append(f"the time budget ended at iteration {iteration} of {total}")
         color, weights = fit.color(), fit.weights()
-    model = Model(settings.network, images.planes, weights, settings, None, source_sha256(buffers))
+    model = Model(settings.network, images.inputs, weights, settings, None, source_sha256(buffers))
     return FitResult(
         color,
         settings,

@@ -41,7 +41,7 @@ class PaperImages:
     notes: tuple[str, ...]
 
     @property
-    def planes(self) -> tuple[str, ...]:
+    def inputs(self) -> tuple[str, ...]:
         """The names of the channels of `network_input`."""
         return (*(f"random {index}" for index in range(self.random_channels)), *self.names)
 

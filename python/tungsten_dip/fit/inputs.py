@@ -1,6 +1,6 @@
 """The inputs of the network of the presets draft, balanced and final, and the weights of its loss.
 
-Planes contain every pixel's features, the brightness of its pilots, and how well each pilot of one half
+They contain every pixel's features, the brightness of its pilots, and how well each pilot of one half
 predicts the other half in the pixels around it: never in the pixel itself, whose noise it is scored by (the
 blind spot of Krull et al. 2019, "Noise2Void"). The scores of two neighbours together do depend on
 that noise, which is why the network's input is one pixel.
@@ -23,9 +23,9 @@ from tungsten_dip.fit.evidence import (
 from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around
 
-PLANES_RADIUS = max(SCORE_RADII)
+INPUTS_RADIUS = max(SCORE_RADII)
 
-# What the planes are made with is part of every saved network (`onnx.file` numbers the format): errors are
+# What the inputs are made with is part of every saved network (`onnx.file` numbers the format): errors are
 # relative to the squared radiance, brightness is in units of the evidence.
 _LOG_OFFSET = 0.02
 """Added before a logarithm: brightnesses far below are not distinguished."""
@@ -63,10 +63,10 @@ def loss_weights(evidence: Evidence) -> Halves:
     return weight_a, weight_b
 
 
-def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
-    """Yield the network's inputs for one half, plane by plane, each of shape (height, width).
+def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
+    """Yield the network's inputs for one half, one after the other, each of shape (height, width).
 
-    A pixel's values come from the pixels up to `PLANES_RADIUS` around it.
+    A pixel's values come from the pixels up to `INPUTS_RADIUS` around it.
     """
     # The other half is at work beside this one.
     threads, layout = max(evidence.threads // 2, 1), evidence.layout
@@ -97,14 +97,14 @@ def planes_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
 
 
 def network_inputs(evidence: Evidence) -> FloatArray:
-    """Return the planes of both halves, shape (2, height * width, planes)."""
+    """Return the inputs of both halves, shape (2, height * width, inputs)."""
     height, width = evidence.halves[0].shape[:2]
-    # Filled plane by plane: this is the largest array of a fit.
-    inputs = np.empty((2, height * width, len(evidence.layout.planes)), np.float32)
+    # Filled one input at a time: this is the largest array of a fit.
+    inputs = np.empty((2, height * width, len(evidence.layout.inputs)), np.float32)
 
     def fill(half: int) -> None:
-        for column, plane in zip(inputs[half].T, planes_of_half(evidence, half), strict=True):
-            column[:] = plane.ravel()
+        for column, image in zip(inputs[half].T, inputs_of_half(evidence, half), strict=True):
+            column[:] = image.ravel()
 
     in_pair(fill, evidence.threads)
     return inputs
