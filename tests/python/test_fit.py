@@ -659,7 +659,7 @@ def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
     result = denoise(buffers, settings, previous=(known, known))
     alone = denoise(buffers, settings)
     assert np.isfinite(result.color).all()
-    assert result.model.layout.candidates == 1
+    assert result.model.layout.candidate_count == 1
 
     def error(image, rows):
         return float(np.mean((image[rows] - reference[rows]) ** 2))

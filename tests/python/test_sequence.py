@@ -403,7 +403,7 @@ def test_followed_frames_have_few_pilots_of_their_own(tmp_path, preset, pilots):
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
     assert follower.models.following.layout.pilots == pilots
-    assert follower.models.following.layout.candidates == 1
+    assert follower.models.following.layout.candidate_count == 1
     assert relmse(followed[1].result.color, frames[1].reference) < 0.3 * relmse(
         frames[1].buffers.color.mean, frames[1].reference
     )

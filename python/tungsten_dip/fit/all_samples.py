@@ -15,11 +15,11 @@ from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
-"""Relative difference of the halves' results from their mean at which ``whole`` gets weight 0.5."""
+"""Relative difference of the halves' results from their mean at which all samples get weight 0.5."""
 
 
-def with_all_samples(fused: Halves, whole: FloatImage, threads: int) -> FloatImage:
-    """Return the mean of both halves' results, moved towards ``whole``, the blended pilots of all samples.
+def with_all_samples(fused: Halves, all_samples_blend: FloatImage, threads: int) -> FloatImage:
+    """Return the mean of both halves' results, moved towards the blended pilots of all samples.
 
     All are linear radiance of shape (height, width, 3). The result moves no further than the halves' results
     differ in the surrounding pixels, and less where they differ strongly.
@@ -31,5 +31,5 @@ def with_all_samples(fused: Halves, whole: FloatImage, threads: int) -> FloatIma
     agreed = (np.float32(_AGREED) * level) ** 2
     share = agreed / (agreed + spread + np.float32(1e-30))
     bound = np.sqrt(spread)
-    moved: FloatImage = image + share * np.clip(whole - image, -bound, bound)
+    moved: FloatImage = image + share * np.clip(all_samples_blend - image, -bound, bound)
     return moved

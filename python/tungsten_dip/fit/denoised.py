@@ -70,14 +70,16 @@ class Denoised:
     notes: tuple[str, ...]
 
 
-def denoised_image(evidence: Evidence, fused: Halves, whole: FloatImage | None) -> Denoised:
+def denoised_image(evidence: Evidence, fused: Halves, all_samples_blend: FloatImage | None) -> Denoised:
     """Make the image from the network's outputs for both halves, or from the input if that is as good.
 
-    ``whole`` are the pilots of all samples, blended with the mean of both halves' weights.
+    ``all_samples_blend`` are the pilots of all samples, blended with the mean of both halves' weights.
     """
     threads = evidence.threads
     fused = with_lost_detail(evidence.halves, fused)
-    image = mean_of(fused) if whole is None else with_all_samples(fused, whole, threads)
+    image = mean_of(fused)
+    if all_samples_blend is not None:
+        image = with_all_samples(fused, all_samples_blend, threads)
     pixels = fused[0].reshape(-1, 3), fused[1].reshape(-1, 3)
     error = estimate_error(evidence.pilots, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 

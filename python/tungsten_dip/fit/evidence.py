@@ -269,22 +269,23 @@ def _noises(errors_of_reference: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, surfaces: Surfaces, candidates: int, drawn: bool) -> None:
+def _check_fits(layout: Layout, surfaces: Surfaces, candidate_count: int, drawn: bool) -> None:
     unknown = [n for n in layout.features if n not in surfaces.names and n not in surfaces.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
         )
-    if layout.candidates > candidates and drawn:
+    if layout.candidate_count > candidate_count and drawn:
         raise InputError(
             "the model chooses among candidates, which cannot be judged without independent halves; fit "
             "without the model"
         )
-    if layout.candidates != candidates:
+    if layout.candidate_count != candidate_count:
         raise InputError(
-            f"the model was fitted with {layout.candidates} candidates (other denoisers' images or the "
-            f"previous frame), this input comes with {candidates}; give as many, or fit without the model"
+            f"the model was fitted with {layout.candidate_count} candidates (other denoisers' images or the "
+            f"previous frame), this input comes with {candidate_count}; give as many, or fit without the "
+            f"model"
         )
 
 

@@ -97,9 +97,9 @@ def fit_fusion(
         settings.device,
         evidence.threads,
     )
-    training, images = _trained(network, start, halved.buffers, settings, preset, clock, progress)
-    fused, whole = _fused(network, start, images)
-    image = denoised_image(evidence, fused, whole)
+    training, all_samples_pilots = _trained(network, start, halved.buffers, settings, preset, clock, progress)
+    fused, all_samples_blend = _fused(network, start, all_samples_pilots)
+    image = denoised_image(evidence, fused, all_samples_blend)
     if not training.interrupted:
         progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
     return FitResult(
@@ -203,14 +203,14 @@ def _wait_for(pending: Future[tuple[FloatImage, ...]]) -> None:
 
 
 def _fused(
-    network: PointwiseNetwork, start: Start, whole_pilots: tuple[FloatImage, ...]
+    network: PointwiseNetwork, start: Start, all_samples_pilots: tuple[FloatImage, ...]
 ) -> tuple[Halves, FloatImage | None]:
     """Return the network's blend of the pilots of both halves and, if given, of all samples."""
     threads, shape = start.evidence.threads, start.evidence.mean.shape
     halves = [start.examples.of_half(half) for half in (0, 1)]
     fused = in_pair(lambda half: network.fuse(halves[half]).reshape(shape), threads)
-    if not whole_pilots:
+    if not all_samples_pilots:
         return fused, None
     return fused, mean_of(
-        in_pair(lambda half: network.fuse(halves[half], whole_pilots).reshape(shape), threads)
+        in_pair(lambda half: network.fuse(halves[half], all_samples_pilots).reshape(shape), threads)
     )

@@ -32,19 +32,19 @@ class Layout:
     """The inputs of a network and the images it chooses among: the same for every image that it is used on.
 
     ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
-    filters compute, then so many ``candidates``: the caller's, Open Image Denoise's, the previous frame.
+    filters compute, then the candidates: the caller's, Open Image Denoise's, the previous frame.
     ``reference`` is the index of the pilot that the others are compared with.
     """
 
     features: tuple[str, ...]
     pilots: tuple[Pilot, ...]
-    candidates: int
+    candidate_count: int
     reference: int
 
     @property
     def choices(self) -> int:
         """How many images the network chooses among."""
-        return 1 + len(self.pilots) + self.candidates
+        return 1 + len(self.pilots) + self.candidate_count
 
     @property
     def denominator(self) -> int:

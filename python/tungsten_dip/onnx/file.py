@@ -102,7 +102,12 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         "source_sha256": model.source_sha256,
     }
     if model.layout is not None:
-        facts["layout"] = asdict(model.layout)
+        facts["layout"] = {
+            "features": model.layout.features,
+            "pilots": [asdict(pilot) for pilot in model.layout.pilots],
+            "candidates": model.layout.candidate_count,
+            "reference": model.layout.reference,
+        }
     return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
 
 
@@ -243,8 +248,8 @@ def _layout(facts: dict[str, Any]) -> Layout:
         if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
             raise InputError("pilots: expected k from 0.01 to 100")
     features = _checked("features", facts.get("features"), tuple[str, ...])
-    candidates, reference = (_checked(n, facts.get(n), int) for n in ("candidates", "reference"))
-    layout = Layout(features, tuple(pilots), candidates, reference)
+    candidate_count, reference = (_checked(n, facts.get(n), int) for n in ("candidates", "reference"))
+    layout = Layout(features, tuple(pilots), candidate_count, reference)
     if not pilots or layout.choices > _MOST_CHOICES or not 0 < reference < layout.choices:
         raise InputError(
             f"layout: expected one pilot or more, and at most {_MOST_CHOICES} images to choose from"

@@ -100,11 +100,11 @@ def infer_fusion(
     halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
     layout = model.layout
     evidence = evidence_from_buffers(halved, settings, layout.pilots, clock, progress, previous, layout)
-    whole_pilots: tuple[FloatImage, ...] = ()
+    all_samples_pilots: tuple[FloatImage, ...] = ()
     if blends_all_samples(settings, following=previous is not None):
-        whole_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
-    fused, whole = _fused(model, evidence, whole_pilots)
-    image = denoised_image(evidence, fused, whole)
+        all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
+    fused, all_samples_blend = _fused(model, evidence, all_samples_pilots)
+    image = denoised_image(evidence, fused, all_samples_blend)
     progress(1.0, "inferred")
     return FitResult(
         color=image.color,
@@ -122,7 +122,7 @@ def infer_fusion(
 
 
 def _fused(
-    model: Model, evidence: Evidence, whole_pilots: Sequence[FloatImage]
+    model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage]
 ) -> tuple[Halves, FloatImage | None]:
     """Return the blended pilots of both halves and, if given, of all samples, computed band by band."""
     # Both halves are computed side by side; the network is too small to share.
@@ -133,8 +133,8 @@ def _fused(
 
     def of_half(half: int) -> tuple[FloatImage, ...]:
         choices = [[pilot[half] for pilot in evidence.pilots]]
-        if whole_pilots:
-            choices.append(list(whole_pilots))
+        if all_samples_pilots:
+            choices.append(list(all_samples_pilots))
         fused = tuple(np.empty_like(evidence.mean) for _ in choices)
         inputs = np.empty((len(model.inputs), min(rows, height), width), np.float32)
         for first in range(0, height, rows):
@@ -154,8 +154,8 @@ def _fused(
         return fused
 
     (half_a, *by_a), (half_b, *by_b) = in_pair(of_half, evidence.threads)
-    whole = mean_of((by_a[0], by_b[0])) if whole_pilots else None
-    return (half_a, half_b), whole
+    all_samples_blend = mean_of((by_a[0], by_b[0])) if all_samples_pilots else None
+    return (half_a, half_b), all_samples_blend
 
 
 def _infer_paper(
