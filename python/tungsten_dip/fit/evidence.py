@@ -35,7 +35,7 @@ from tungsten_dip.progress import Progress
 
 _NOISE_RADIUS = 8
 _NEAR_RADIUS = 2
-"""Of the windows that must be empty for a pixel to be empty space."""
+"""Radius of the window in which no sample may have hit anything, for a pixel to be empty space."""
 
 OUTLIER = 20.0
 """Squared errors are capped at so many times the local mean where local noise is estimated from them."""

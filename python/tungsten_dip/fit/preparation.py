@@ -72,7 +72,7 @@ def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
     contains; of surfaces in percent, or in 8 bits, it is not.
     """
     color = buffers.color.mean
-    if buffers.albedo is None or not color.any():  # a black colour says nothing about the albedo
+    if buffers.albedo is None or not color.any():  # a black colour shows nothing of the albedo
         return buffers
     albedo = buffers.albedo.mean
     unseen = (albedo > _LARGEST_ALBEDO) & (color < _SEEN_LIGHT * albedo)

@@ -51,7 +51,7 @@ _LARGEST_SHAPE = 1e8
 class HalvedImage:
     """Sanitised buffers whose colour has independent halves, and the candidates that these can score.
 
-    ``drawn`` indicates that the halves were drawn from the image; ``notes`` say why.
+    ``drawn`` indicates that the halves were drawn from the image; ``notes`` give the reason.
     """
 
     buffers: RenderBuffers
