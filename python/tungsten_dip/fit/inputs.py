@@ -1,6 +1,6 @@
 """The inputs of the network of the presets draft, balanced and final, and the weights of its loss.
 
-They contain every pixel's features, the brightness of its pilots, and how well each pilot of one half
+Inputs contain every pixel's features, the brightness of its pilots, and how well each pilot of one half
 predicts the other half in the pixels around it: never in the pixel itself, whose noise it is scored by (the
 blind spot of Krull et al. 2019, "Noise2Void"). The scores of two neighbours together do depend on
 that noise, which is why the network's input is one pixel.
