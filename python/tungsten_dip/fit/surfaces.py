@@ -14,11 +14,12 @@ from tungsten_dip.buffers.prefilter import prefilter_features
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
-# far away.
+# far away. The scale of the depth makes its differences large beside the ridge of the regression: along a wall
+# the light changes with the distance, which therefore has to explain it.
 _NORMAL_PENALTY = 3.0
 _ALBEDO_PENALTY = 20.0
-_DEPTH_PENALTY = 5.0
-_DEPTH_SCALE = 3.0
+_DEPTH_PENALTY = 0.14
+_DEPTH_SCALE = 18.0
 
 _LEAST_ALBEDO = 0.01
 """Added to the albedo that divides the colour, so that dark surfaces keep their noise finite."""
