@@ -20,7 +20,7 @@ from tungsten_dip.bench.pareto import run_pareto
 from tungsten_dip.bench.results import COLUMNS, Key, Measurement, Results
 from tungsten_dip.bench.sets import cropped_as_published, read_sets
 from tungsten_dip.bench.table import Row, SetRows, markdown_table
-from tungsten_dip.buffers import RenderBuffers, read_image, write_image, write_tungsten_folder
+from tungsten_dip.buffers import RenderBuffers, read_image, write_denoised, write_image, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
@@ -137,6 +137,23 @@ def test_a_crop_keeps_the_middle_in_multiples_of_32(tmp_path, make_render):
     assert crop.name != whole.name
     assert crop.digest != whole.digest
     assert cropped_as_published(crop).digest == crop.digest
+
+
+def test_alpha_and_spp_are_cropped_and_make_another_set(tmp_path, make_render):
+    render = make_render(67, 101)
+    alpha = np.linspace(0, 1, 67 * 101, dtype=np.float32).reshape(67, 101, 1)
+    result = FitResult(render.buffers.color.mean, FitSettings(), 0.0, 1)
+    write_image(tmp_path / "reference.exr", render.reference)
+    digests = set()
+    for more in ({}, {"alpha": alpha}, {"spp": 4.0}, {"spp": 8.0}, {"spp": alpha + 1}):
+        write_denoised(tmp_path / "set.exr", result, replace(render.buffers, **more))
+        (whole,) = read_sets([f"{tmp_path / 'set.exr'}={tmp_path / 'reference.exr'}"])
+        digests.add(whole.digest)
+        crop = cropped_as_published(whole).buffers
+        for name, values in more.items():
+            expected = values[1:65, 2:98] if isinstance(values, np.ndarray) else values
+            np.testing.assert_array_equal(getattr(crop, name), expected)
+    assert len(digests) == 5
 
 
 def test_what_is_too_small_to_crop_is_refused(bench_set):

@@ -74,13 +74,14 @@ def cropped_as_published(bench_set: BenchSet) -> BenchSet:
 
 
 def cropped(buffers: RenderBuffers, part: tuple[slice, slice]) -> RenderBuffers:
-    """Return rows and columns of what a fit sees: every plane of every quantity, and the samples."""
+    """Return rows and columns of what a fit sees: every plane of every quantity, alpha and the samples."""
     quantities = {
         name: Buffer(**{plane: np.ascontiguousarray(values[part]) for plane, values in buffer.planes()})
         for name, buffer in buffers.quantities()
     }
-    spp = buffers.spp[part] if isinstance(buffers.spp, np.ndarray) else buffers.spp
-    return RenderBuffers(quantities.pop("color"), spp=spp).with_quantities(**quantities)
+    spp = np.ascontiguousarray(buffers.spp[part]) if isinstance(buffers.spp, np.ndarray) else buffers.spp
+    alpha = None if buffers.alpha is None else np.ascontiguousarray(buffers.alpha[part])
+    return RenderBuffers(quantities.pop("color"), spp=spp, alpha=alpha).with_quantities(**quantities)
 
 
 def _read_set(text: str) -> BenchSet:
@@ -107,10 +108,16 @@ def _check_size(image_path: Path, image: FloatImage, path: Path, buffers: Render
 
 
 def _bench_set(name: str, buffers: RenderBuffers, reference: FloatImage, nfor: FloatImage | None) -> BenchSet:
+    planes = (
+        (quantity + plane, image)
+        for quantity, buffer in buffers.quantities()
+        for plane, image in buffer.planes()
+    )
+    more = (("alpha", buffers.alpha), ("spp", buffers.spp), ("reference", reference), ("nfor", nfor))
     digest = hashlib.sha256()
-    images = [reference, *(plane for _, buffer in buffers.quantities() for _, plane in buffer.planes())]
-    for image in images if nfor is None else [*images, nfor]:
-        digest.update(np.ascontiguousarray(image).tobytes())
+    for what, value in (*planes, *more):
+        if value is not None:
+            digest.update(what.encode() + np.asarray(value).tobytes())
     return BenchSet(name, buffers, reference, nfor, digest.hexdigest()[:12])
 
 
