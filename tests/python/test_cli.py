@@ -36,6 +36,7 @@ from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import silent
+from tungsten_dip.scene.types import OutputBuffer
 from tungsten_dip.sequence.following import Followed
 
 MAIN = "import sys; from tungsten_dip.cli.{} import main; sys.exit(main())"
@@ -551,10 +552,12 @@ def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capf
 def test_negative_radiance_is_black_in_a_hdr_and_loses_no_render(tmp_path, caplog):
     radiance = np.full((2, 3, 3), 0.5, np.float32)
     radiance[0, 0] = -0.25
-    path = tmp_path / "c.hdr"
-    write_render(RenderBuffers(Buffer(radiance)), SceneOutputs(ldr=None, hdr=path), "gamma")
-    np.testing.assert_array_equal(read_image(path), np.maximum(radiance, 0))
-    assert "holds no negative radiance" in caplog.text
+    picture, buffer = tmp_path / "picture.hdr", tmp_path / "buffer.hdr"
+    request = OutputBuffer(type="color", hdr_output_file=str(buffer))
+    write_render(RenderBuffers(Buffer(radiance)), SceneOutputs(None, picture, (request,)), "gamma")
+    for path in (picture, buffer):
+        np.testing.assert_array_equal(read_image(path), np.maximum(radiance, 0))
+        assert f"{path}: holds no negative values" in caplog.text
 
 
 @pytest.mark.parametrize(

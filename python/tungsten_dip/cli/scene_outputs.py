@@ -148,11 +148,7 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: Tonemap
     render left it: it would pass for this one's.
     """
     if outputs.hdr is not None:
-        radiance = buffers.color.mean
-        if outputs.hdr.suffix.lower() == ".hdr" and (radiance < 0).any():
-            _LOG.warning("%s: holds no negative radiance, which is 0 there; .exr does", outputs.hdr)
-            radiance = np.maximum(radiance, 0)
-        write_image(outputs.hdr, radiance)
+        _write(outputs.hdr, buffers.color.mean)
     if outputs.ldr is not None:
         write_image(outputs.ldr, display_from_radiance(buffers.color.mean, tonemap))
     outdated = []
@@ -162,12 +158,20 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: Tonemap
             if array is not None:
                 if path.suffix.lower() in _LDR and plane != "variance":
                     array = ldr_from_feature(request.type, array)
-                write_image(path, array)
+                _write(path, array)
             elif path.is_file():
                 path.unlink()
                 outdated.append(path.name)
     if outdated:
         _LOG.info("removed what an earlier render left and this one does not have: %s", ", ".join(outdated))
+
+
+def _write(path: Path, image: FloatImage) -> None:
+    """Write an image as far as its format holds it: a refusal would come after the render, and lose it."""
+    if path.suffix.lower() == ".hdr" and (image < 0).any():
+        _LOG.warning("%s: holds no negative values, which are 0 there; .exr does", path)
+        image = np.maximum(image, 0)
+    write_image(path, image)
 
 
 def _files_of(request: OutputBuffer) -> Iterator[tuple[str, Path]]:
