@@ -297,6 +297,14 @@ def test_features_are_those_of_the_view_layer_that_the_map_names(tmp_path: Path)
         assert buffers.normal is None
 
 
+def test_the_map_chooses_between_two_spellings(tmp_path: Path) -> None:
+    channels = save(tmp_path / "a.exr", *"RGB", *"rgb", "A")
+    for spelling in ("RGB", "rgb"):
+        buffers = read_buffers(tmp_path / "a.exr", {"color": ",".join(spelling)})
+        assert holds(buffers.color, channels, *spelling)
+        assert np.array_equal(buffers.alpha[..., 0], channels["A"])
+
+
 def test_a_colour_whose_prefix_is_no_view_layer_has_the_features_of_any(tmp_path: Path) -> None:
     channels = save(tmp_path / "a.exr", *rgb("beauty.rgb"), *rgb("aov.albedo"), *xyz("aov.normal"))
     buffers = read_buffers(tmp_path / "a.exr", {"color": "beauty.rgb"})

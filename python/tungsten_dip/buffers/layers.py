@@ -251,5 +251,6 @@ def _alpha(
 ) -> str | None:
     if "alpha" in mapping:
         return None if mapping["alpha"] == NOTHING else _mapped("alpha", mapping["alpha"], names, layers)[0]
-    own = next(components for components in layers.values() if color[0] in components.values())
+    # Of two spellings, such as R and r, only one is in the layers.
+    own = next((components for components in layers.values() if color[0] in components.values()), {})
     return own.get("A") or layers.get("", {}).get("A")
