@@ -105,6 +105,13 @@ def test_a_paper_network_starts_from_the_weights(frame: SyntheticRender) -> None
         np.testing.assert_allclose(again.model.weights[name], value, atol=3e-3)
 
 
+def test_a_paper_network_whose_weights_overflow_is_refused(frame: SyntheticRender) -> None:
+    fit = paper_model("resnet", frame.buffers)
+    huge = replace(fit, weights={name: np.full_like(value, 1e38) for name, value in fit.weights.items()})
+    with pytest.raises(InputError, match="its weights are too large; fit a new one"):
+        denoise(frame.buffers, replace(fit.settings, iterations=3), warm_start=huge)
+
+
 def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
     model: Model, frame: SyntheticRender
 ) -> None:

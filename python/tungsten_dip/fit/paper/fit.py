@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.model import Model, Weights, check_inputs, source_sha256
+from tungsten_dip.fit.model import Model, Weights, check_finite, check_inputs, source_sha256
 from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.paper.device import compute_device, convolution_dtype
 from tungsten_dip.fit.paper.images import PaperImages, network_input, paper_images
@@ -153,7 +153,7 @@ def fit_paper(
     CPU, the same seed and number of threads give the same bits.
 
     Raises InputError if a feature named by the inputs is missing, the device is not there, or the model does
-    not fit the image or the settings.
+    not fit the image or the settings or gives no finite image.
     """
     clock = Clock(settings.time_budget_s)
     images = paper_images(buffers, settings)
@@ -168,6 +168,8 @@ def fit_paper(
         try:
             while iteration < total:
                 fit.step()
+                if iteration == 0:
+                    check_finite(np.asarray(fit.loss, np.float32))  # later steps go back to good weights
                 iteration += 1
                 spent = clock.share_spent()
                 done = iteration == total or spent >= 1
