@@ -716,6 +716,7 @@ def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_pat
         ("-o {tmp}/none/a.png {scene}", ["{tmp}/none/a.png"]),
         ("-o {tmp}/a.jpg {scene}", ["{tmp}/a.jpg", ".png"]),
         ("-c 10m {scene}", ["--checkpoint", "--host tungsten"]),
+        ("--host tungsten --dip-denoise --dip-preview -c 0 {scene}", ["--checkpoint 0", "--dip-preview"]),
         ("--timeout x {scene}", ["--timeout"]),
         ("--dip-denoise --dip-time-budget=-5 {scene}", ["--dip-time-budget", "-5"]),
         ("{tmp}/none.json", ["{tmp}/none.json", "found none"]),
@@ -899,6 +900,29 @@ def test_results_with_a_name_that_is_no_text_are_told(folder, tmp_path):
     assert done.returncode == 0
     assert b"bad\\udcff.exr: 2 iterations" in done.stdout
     assert picture.exists()
+
+
+@pytest.mark.parametrize(
+    ("of_scene", "given", "expected"),
+    [("0", [], 60), ("5", [], None), ("0", ["-c", "90s"], 90), ("x", [], "checkpoint_interval: expected")],
+)
+def test_a_preview_is_made_every_minute_where_no_other_time_is_named(
+    of_scene, given, expected, tmp_path, monkeypatch, capfd
+):
+    def drive(path, options, on_checkpoint, progress):
+        asked.append(options.checkpoint_interval_s)
+        raise InputError("enough")
+
+    asked = []
+    monkeypatch.setattr(tungsten.tungsten_host, "in_process", lambda: True)
+    monkeypatch.setattr(tungsten.tungsten_host, "drive", drive)
+    scene = write_scene(tmp_path / "scene.json", checkpoint_interval=of_scene)
+    options = ["--host", "tungsten", "--dip-denoise", "--dip-preview", *given, str(scene)]
+    if isinstance(expected, str):
+        fails(capfd, tungsten.main(options), expected)
+    else:
+        fails(capfd, tungsten.main(options), "enough")
+        assert asked == [expected]
 
 
 def test_ctrl_c_in_the_fit_of_a_preview_ends_the_render(tmp_path, fits, render, monkeypatch):

@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import tungsten_dip
 from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
@@ -40,6 +40,9 @@ from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import Camera, PerspectiveCamera, Scene, TonemapName
 
 _LOG = logging.getLogger(__name__)
+
+_PREVIEW_INTERVAL_S = 60.0
+"""Between checkpoints, where there is to be a preview at each and neither options nor scene name a time."""
 
 Denoise = Callable[[Camera, RenderBuffers], FitResult]
 """Denoises the render of a camera."""
@@ -102,6 +105,10 @@ def _run(arguments: Sequence[str] | None) -> None:
         raise InputError(
             "Mitsuba saves no checkpoints for --checkpoint and --dip-preview; add --host tungsten"
         )
+    if options.dip_preview and options.checkpoint == 0:
+        raise InputError(
+            "--checkpoint 0: without checkpoints there is no --dip-preview; name a time between them, as 5m"
+        )
     if host == "tungsten" and not options.dip_denoise:
         run_native(_stock_arguments(arguments))
     if host == "tungsten" and not tungsten_host.in_process():
@@ -163,7 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     dip.add_argument(
         "--dip-preview",
         action="store_true",
-        help="denoise quickly at every checkpoint, as <stem>_preview.png (with Tungsten)",
+        help="denoise quickly every minute, or at the checkpoints, as <stem>_preview.png (with Tungsten)",
     )
     dip.add_argument("--dip-report", dest="report", metavar="R.html", type=Path, help=REPORT_HELP)
     return parser
@@ -325,7 +332,7 @@ def _driver_options(
         spp=options.spp,
         seed=options.seed,
         restart=options.restart,
-        checkpoint_interval_s=options.checkpoint,
+        checkpoint_interval_s=_checkpoint_interval(scene, options),
         timeout_s=options.timeout,
         input_directory=options.input_directory,
         output_directory=options.output_directory,
@@ -333,6 +340,14 @@ def _driver_options(
         output_file=outputs.ldr.absolute() if asked_ldr and outputs.ldr else None,
         hdr_output_file=outputs.hdr.absolute() if asked_hdr and outputs.hdr else None,
     )
+
+
+def _checkpoint_interval(scene: Scene, options: argparse.Namespace) -> float | None:
+    """Return the seconds between checkpoints, None as the scene has it."""
+    if options.dip_preview and options.checkpoint is None and not _seconds(scene, "checkpoint_interval"):
+        return _PREVIEW_INTERVAL_S
+    checkpoint: float | None = options.checkpoint
+    return checkpoint
 
 
 def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Progress) -> RenderBuffers:
@@ -348,14 +363,14 @@ def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Pr
         spp=options.spp,
         seed=options.seed or 0,
         threads=options.threads,
-        timeout_s=(_timeout_of(scene) if options.timeout is None else options.timeout) or None,
+        timeout_s=(_seconds(scene, "timeout") if options.timeout is None else options.timeout) or None,
         progress=progress,
         quantities=[name for name in CHANNELS if name in wanted],
     )
 
 
-def _timeout_of(scene: Scene) -> float:
+def _seconds(scene: Scene, setting: Literal["checkpoint_interval", "timeout"]) -> float:
     try:
-        return minutes(scene.renderer.timeout)
+        return minutes(getattr(scene.renderer, setting))
     except argparse.ArgumentTypeError as error:
-        raise InputError(f"{scene.path}: renderer.timeout: {error}; correct it") from None
+        raise InputError(f"{scene.path}: renderer.{setting}: {error}; correct it") from None
