@@ -106,14 +106,16 @@ def test_ticks_enclose_the_errors(low, high, ticks):
     assert _round_ticks(low, high) == ticks
 
 
-def test_what_is_not_known_is_said_and_not_drawn(render):
+@pytest.mark.parametrize("error", [None, 0.1])
+def test_what_is_not_known_is_not_shown(error, render):
     buffers = RenderBuffers(Buffer(render.buffers.color.mean))
-    fitted = FitResult(render.reference, FitSettings(), 1.0, 10, history=(HistoryPoint(1.0, 10, None),))
+    fitted = FitResult(render.reference, FitSettings(), 1.0, 10, history=(HistoryPoint(1.0, 10, error),))
     page = Page(report_page("room", buffers, fitted, "gamma"))
     tags = [tag for tag, _ in page.elements]
     assert images_of(page) == ["noisy", "denoised"]
     assert "svg" not in tags
-    assert "the error was not estimated" in page.text
+    assert "Error over time" not in page.text
+    assert "independent halves" not in page.text
     assert "the colour only" in page.text
 
 

@@ -42,8 +42,7 @@ def report_page(
         html.figures(_figures(result)),
         html.comparison(pictures, left=0, right=1),
         *_error_map(result),
-        "<h2>Error over time</h2>",
-        _curve(result.history),
+        *_curve(result.history),
         *(("<h2>Guided by</h2>", html.gallery(features)) if features else ()),
         "<h2>Settings</h2>",
         html.facts(_settings(result)),
@@ -99,12 +98,12 @@ def _error_map(result: FitResult) -> Iterator[str]:
     yield html.error_scale(most)
 
 
-def _curve(history: Sequence[HistoryPoint]) -> str:
-    """Return the estimated relMSE over seconds as an SVG, its vertical axis logarithmic."""
+def _curve(history: Sequence[HistoryPoint]) -> Iterator[str]:
+    """Yield the estimated relMSE over seconds as an SVG, its axis logarithmic, if there is a line to draw."""
     # An estimate without bias may fall below zero where the error is tiny; a logarithm cannot show it.
     known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
     if len(known) < 2:
-        return "<p>There were no independent halves, so the error was not estimated during the fit.</p>"
+        return
     end_s = max(known[-1][0].seconds, 1e-9)
     ticks = _round_ticks(min(relmse for _, relmse in known), max(relmse for _, relmse in known))
     bottom, top = math.log10(ticks[0]), math.log10(ticks[-1])
@@ -129,7 +128,7 @@ def _curve(history: Sequence[HistoryPoint]) -> str:
         beside=[Label(y(tick), f"{tick:g}") for tick in ticks],
         height=_CURVE_HEIGHT,
     )
-    return f"<p>Estimated relMSE, logarithmic.</p>{plot}"
+    yield f"<h2>Error over time</h2><p>Estimated relMSE, logarithmic.</p>{plot}"
 
 
 def _round_ticks(low: float, high: float) -> list[float]:
