@@ -105,21 +105,16 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     height, width = taken[0].shape[:2]
     radius = max(height, width) // 4
     pixels = np.outer(_extents(height, radius), _extents(width, radius))[:, :, None]
-    mean = _mean(np.float32(0.5) * (taken[0] + taken[1]), radius, threads)
-    squares = _mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
+    mean = _core.box_mean(np.float32(0.5) * (taken[0] + taken[1]), radius, threads)
+    squares = _core.box_mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
     certain = np.maximum(mean - np.float32(_SURELY) * np.sqrt(squares / pixels), 0)
     a, b = (channel_mean(half) for half in halves)
-    level = _mean(np.float32(0.5) * (a + b), _RADIUS, threads)
-    noise = _mean(np.abs(a - b), _RADIUS, threads)
-    share = noise / np.maximum(_mean(noise, radius, threads), np.float32(_LEAST))
+    level = _core.box_mean(np.float32(0.5) * (a + b), _RADIUS, threads)
+    noise = _core.box_mean(np.abs(a - b), _RADIUS, threads)
+    share = noise / np.maximum(_core.box_mean(noise, radius, threads), np.float32(_LEAST))
     gain = 1 + certain * share / np.maximum(level, np.float32(_LEAST))
     bounded: FloatImage = np.minimum(gain, _LARGEST_GAIN).astype(np.float32)
     return bounded
-
-
-def _mean(values: FloatImage, radius: int, threads: int) -> FloatImage:
-    # The sums behind it cancel to below 0.
-    return np.maximum(_core.box_mean(values, radius, threads), 0)
 
 
 def _extents(size: int, radius: int) -> npt.NDArray[np.int64]:
