@@ -57,7 +57,7 @@ def fits(monkeypatch):
         color = (buffers.color.mean + buffers.color.mean.mean()) / 2
         return FitResult(color, settings, 0.0, len(calls))
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", denoise)
+    monkeypatch.setattr("tungsten_dip.bench.methods.denoise", denoise)
     monkeypatch.setattr("tungsten_dip.bench.pareto._warm_up", lambda bench_set, plan, series: None)
     monkeypatch.setattr("tungsten_dip.bench.pareto.write_pareto_plot", lambda folder, found: None)
     monkeypatch.setattr("tungsten_dip.bench.pareto.pareto_page", lambda found, facts, repeats: "the page")
@@ -245,7 +245,7 @@ def test_an_interrupt_loses_the_measurement_in_hand_alone(bench_set, fits, tmp_p
             fits.append(settings)
         return FitResult(buffers.color.mean, settings, 0.0, 1)
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", interrupted)
+    monkeypatch.setattr("tungsten_dip.bench.methods.denoise", interrupted)
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         run_pareto([bench_set], QUICK, tmp_path)
@@ -329,7 +329,7 @@ def test_more_samples_cost_what_they_take_beyond_the_noisy_render(
         return make_render(32, 48, spp=spp, seed=seed).buffers
 
     clock = iter(range(0, 800, 8))
-    monkeypatch.setattr("tungsten_dip.hosts.render", render)
+    monkeypatch.setattr("tungsten_dip.bench.methods.render", render)
     monkeypatch.setattr("tungsten_dip.bench.methods.time.perf_counter", lambda: float(next(clock)))
     plan = replace(QUICK, kinds=("samples",), scenes=(scene,), sample_factors=(2, 4), repeats=2)
     (found,) = run_pareto([bench_set], plan, tmp_path / "bench")

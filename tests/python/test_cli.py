@@ -1,4 +1,3 @@
-import importlib
 import io
 import json
 import logging
@@ -27,7 +26,7 @@ from tungsten_dip.buffers import (
 )
 from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.source import Part
-from tungsten_dip.cli import console, entry, tungsten
+from tungsten_dip.cli import console, denoising, entry, tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes, progress_on_stderr
 from tungsten_dip.cli.scene_outputs import SceneOutputs, write_render
@@ -89,7 +88,7 @@ def fits(monkeypatch):
             history=(HistoryPoint(0.5, 3, 0.5), HistoryPoint(1.5, 7, 0.25)),
         )
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", denoise, raising=False)
+    monkeypatch.setattr("tungsten_dip.cli.denoising.denoise", denoise)
     return calls
 
 
@@ -105,7 +104,7 @@ def renders(monkeypatch, make_render):
         unwanted = {"albedo", "normal", "depth"}.difference(quantities)
         return buffers.with_quantities(**dict.fromkeys(unwanted))
 
-    monkeypatch.setattr("tungsten_dip.hosts.mitsuba.render.render", render)
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", render)
     monkeypatch.setattr("tungsten_dip.hosts.tungsten.available", lambda: False)
     return calls
 
@@ -501,7 +500,7 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
     tmp_path, renders, fits, capfd, monkeypatch
 ):
     scenes = write_frames(tmp_path, "one", "two", "three")
-    finished = tungsten_dip.fit.denoise
+    finished = denoising.denoise
 
     def interrupted(buffers, settings, progress, warm_start=None, previous=None):
         if fits:
@@ -534,7 +533,7 @@ def test_scenes_that_would_write_over_one_another_are_refused(second, options, t
 
 
 def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capfd, monkeypatch):
-    render, seen = importlib.import_module("tungsten_dip.hosts.mitsuba.render").render, []
+    render, seen = tungsten.render_with_mitsuba, []
 
     def fails_at_first(scene, **options):
         seen.append(scene)
@@ -542,7 +541,7 @@ def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capf
             raise InputError("a light that there is not")
         return render(scene, **options)
 
-    monkeypatch.setattr("tungsten_dip.hosts.mitsuba.render.render", fails_at_first)
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", fails_at_first)
     scenes = [str(write_scene(tmp_path / name)) for name in ("a.json", "b.json")]
     assert tungsten.main(["--host", "mitsuba", *scenes]) == 2
     assert "1 of 2 scenes failed" in capfd.readouterr().err
@@ -763,7 +762,7 @@ def test_an_internal_error_is_one_line_and_a_traceback_only_on_demand(folder, tm
     def broken(buffers, settings, progress, warm_start):
         raise RuntimeError("a bug\nin two lines")
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", broken, raising=False)
+    monkeypatch.setattr("tungsten_dip.cli.denoising.denoise", broken)
     arguments = ["denoise", str(folder), "-o", str(tmp_path / "out.exr")]
     assert command.main(arguments) == 1
     last = capfd.readouterr().err.splitlines()[-1]
@@ -787,7 +786,7 @@ def test_a_missing_part_of_the_package_is_named(folder, tmp_path, monkeypatch, c
     def fit(*_, **__):
         raise ModuleNotFoundError("No module named 'drjit'", name="drjit")
 
-    monkeypatch.setattr("tungsten_dip.fit.denoise", fit)
+    monkeypatch.setattr("tungsten_dip.cli.denoising.denoise", fit)
     arguments = ["denoise", str(folder), "-o", str(tmp_path / "out.exr")]
     fails(capfd, command.main(arguments), "pip install 'tungsten-dip[mitsuba]'")
 
@@ -926,9 +925,9 @@ def test_a_preview_is_made_every_minute_where_no_other_time_is_named(
 
 
 def test_ctrl_c_in_the_fit_of_a_preview_ends_the_render(tmp_path, fits, render, monkeypatch):
-    finished = tungsten_dip.fit.denoise
+    finished = denoising.denoise
     monkeypatch.setattr(
-        "tungsten_dip.fit.denoise",
+        "tungsten_dip.cli.denoising.denoise",
         lambda *given, **more: replace(finished(*given, **more), interrupted=True),
     )
     outputs = tungsten.SceneOutputs(tmp_path / "room.png", tmp_path / "room.exr")
@@ -950,9 +949,9 @@ def test_an_error_map_is_written_where_no_network_was_fitted(tmp_path, render, c
 
 def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkeypatch):
     scenes = [write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png") for name in ("one", "two")]
-    finished = tungsten_dip.fit.denoise
+    finished = denoising.denoise
     monkeypatch.setattr(
-        "tungsten_dip.fit.denoise",
+        "tungsten_dip.cli.denoising.denoise",
         lambda *given, **more: replace(finished(*given, **more), interrupted=True),
     )
     assert tungsten.main(["--dip-denoise", "-o", str(tmp_path / "one.png"), str(scenes[0])]) == 130

@@ -16,10 +16,13 @@ from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
+from tungsten_dip.fit import denoise
 from tungsten_dip.fit.oidn import Quality, oidn_image
 from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.settings import FitSettings, Preset
+from tungsten_dip.hosts import render
 from tungsten_dip.progress import Progress
+from tungsten_dip.scene.parse import load_scene
 
 _LOG = logging.getLogger(__name__)
 
@@ -200,8 +203,6 @@ def _ours(
     bench_set: BenchSet, series: str, label: str, mark: str, settings: FitSettings, pictured: bool
 ) -> Method:
     def run(repeat: int, progress: Progress) -> list[Outcome]:
-        from tungsten_dip.fit import denoise
-
         start = time.perf_counter()
         result = denoise(bench_set.buffers, settings, progress)
         return [Outcome(label, result.color, time.perf_counter() - start, result.iterations)]
@@ -250,9 +251,6 @@ def _nfor(bench_set: BenchSet, plan: Plan) -> Iterator[Method]:
 
 
 def _samples(bench_set: BenchSet, plan: Plan, scene_path: Path) -> Iterator[Method]:
-    from tungsten_dip.hosts import render
-    from tungsten_dip.scene.parse import load_scene
-
     scene = load_scene(scene_path)
     size = (bench_set.buffers.width, bench_set.buffers.height)
     if tuple(scene.camera.resolution) != size:

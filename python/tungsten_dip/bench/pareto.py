@@ -15,7 +15,9 @@ from tungsten_dip.bench.sets import BenchSet, cropped
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.extras import require
+from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.oidn import oidn_image
+from tungsten_dip.hosts import render
 from tungsten_dip.progress import Progress, silent
 
 
@@ -77,9 +79,6 @@ def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
 
 
 def _warm_up_with(tiny: RenderBuffers, plan: Plan, series: Collection[str]) -> None:
-    from tungsten_dip.fit import FitSettings, denoise
-    from tungsten_dip.hosts import render
-
     if not {OURS, IN_TIME}.isdisjoint(series):
         denoise(tiny, FitSettings("draft", iterations=1, threads=plan.threads))
     if PAPER in series:

@@ -11,10 +11,12 @@ from typing import get_args, get_type_hints
 from tungsten_dip.buffers import RenderBuffers, write_text
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import denoise
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.report.page import report_page
 from tungsten_dip.scene.types import TonemapName
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
@@ -79,8 +81,6 @@ def denoise_with_progress(
     buffers: RenderBuffers, settings: FitSettings, warm_start: Model | None = None
 ) -> FitResult:
     """Denoise the buffers and show progress on stderr."""
-    from tungsten_dip.fit import denoise
-
     with progress_on_stderr("denoising") as progress:
         return denoise(buffers, settings, progress, warm_start=warm_start)
 
@@ -106,8 +106,6 @@ def write_report(
     remarks: Sequence[str],
 ) -> None:
     """Write the HTML page whole or not at all."""
-    from tungsten_dip.report.page import report_page  # imports all of the scene layer
-
     write_text(path, report_page(title, buffers, result, tonemap, remarks))
 
 

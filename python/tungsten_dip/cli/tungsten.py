@@ -29,6 +29,7 @@ from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
 from tungsten_dip.hosts import Host, chosen_host
 from tungsten_dip.hosts import tungsten as tungsten_host
+from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.hosts.native import run_native
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
@@ -351,14 +352,12 @@ def _checkpoint_interval(scene: Scene, options: argparse.Namespace) -> float | N
 
 
 def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Progress) -> RenderBuffers:
-    from tungsten_dip.hosts.mitsuba.render import render  # imports Mitsuba
-
     if scene.renderer.enable_resume_render:
         _LOG.warning("%s: asks to resume; Mitsuba saves no state and starts from 0 spp", scene.path)
     wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}
     if options.dip_denoise:
         wanted |= set(decision_of(scene).buffers)
-    return render(
+    return render_with_mitsuba(
         scene,
         spp=options.spp,
         seed=options.seed or 0,

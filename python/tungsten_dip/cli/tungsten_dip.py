@@ -51,6 +51,8 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs, Preset
 from tungsten_dip.remarks import remarks_from_log
+from tungsten_dip.scene.effects import inspect_facts, inspect_text
+from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
@@ -226,9 +228,6 @@ def _denoised(
 
 def _inspect(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if options.input.suffix.lower() == ".json":
-        from tungsten_dip.scene.effects import inspect_facts, inspect_text
-        from tungsten_dip.scene.parse import load_scene
-
         scene = load_scene(options.input)
         return inspect_facts(scene), inspect_text(scene)
     return _facts_of_buffers(read_buffers(options.input))

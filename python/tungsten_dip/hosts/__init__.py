@@ -9,6 +9,8 @@ from typing import Literal, get_args
 
 from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
+from tungsten_dip.hosts import tungsten
+from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Scene
@@ -23,8 +25,6 @@ Host = Literal["auto", "tungsten", "mitsuba"]
 
 def chosen_host(host: Host) -> Literal["tungsten", "mitsuba"]:
     """Return who renders, of "auto" what `render` says."""
-    from tungsten_dip.hosts import tungsten
-
     if host != "auto":
         return host
     return "tungsten" if tungsten.available() else "mitsuba"
@@ -48,9 +48,6 @@ def render(
     """
     if host not in get_args(Host):
         raise InputError(f"host: expected one of {', '.join(get_args(Host))}, got {host}")
-    from tungsten_dip.hosts import tungsten
-    from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
-
     host = chosen_host(host)
     path, folder = (scene.path, scene.input_directory) if isinstance(scene, Scene) else (scene, None)
     _LOG.info("%s: rendered by %s", path, host.capitalize())
