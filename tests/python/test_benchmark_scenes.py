@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tungsten_dip.scene import load_scene
+from tungsten_dip.scene.parse import load_scene
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 

@@ -1051,7 +1051,7 @@ def test_ctrl_c_that_is_ignored_does_not_end_a_render(scene):
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "with entry._leaving_on_interrupt('tungsten'):\n"
         "    from tungsten_dip.hosts.mitsuba.render import render\n"
-        "    from tungsten_dip.scene import load_scene\n"
+        "    from tungsten_dip.scene.parse import load_scene\n"
         "pressed = []\n"
         "def press(fraction, message):\n"
         "    if fraction < 1:\n"

@@ -16,7 +16,7 @@ from tungsten_dip.buffers.model import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts import memory, tungsten
 from tungsten_dip.hosts.mitsuba.render import render
-from tungsten_dip.scene import load_scene
+from tungsten_dip.scene.parse import load_scene
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tungsten_dip.scene import decision_of, effects_of, inspect_facts, inspect_text, load_scene
+from tungsten_dip.scene.effects import decision_of, effects_of, inspect_facts, inspect_text
+from tungsten_dip.scene.parse import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.scene import load_scene
 from tungsten_dip.scene import types as t
+from tungsten_dip.scene.parse import load_scene
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*/scene.json"))
 

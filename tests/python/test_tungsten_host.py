@@ -21,7 +21,7 @@ from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.hosts import memory, native, tungsten
-from tungsten_dip.scene import load_scene
+from tungsten_dip.scene.parse import load_scene
 
 ROOT, BUILD = os.environ.get("Tungsten_ROOT"), os.environ.get("Tungsten_BUILD")  # noqa: SIM112
 pytestmark = [
