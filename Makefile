@@ -11,7 +11,7 @@ ifeq ($(origin CXX),default)
 CXX := c++
 endif
 
-CXX_FOLDERS := $(wildcard cpp mitsuba_ext tungsten_ext tests/cpp)
+CXX_FOLDERS := cpp mitsuba_ext tungsten_ext tests/cpp
 CXX_SOURCES := $(shell find $(CXX_FOLDERS) -name '*.[ch]pp')
 BUILD_FILES := pyproject.toml setup.py $(shell find CMakeLists.txt $(CXX_FOLDERS) -name CMakeLists.txt)
 
