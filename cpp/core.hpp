@@ -122,12 +122,12 @@ void box_mean(ConstImage in, int radius, Image out, int threads);
 
 // Whether the noise of two halves is independent, as everything that scores one half by the other assumes.
 struct HalvesTest {
-    // Of the two halves' errors; NaN if nothing in the image tells.
+    // Of the two halves' errors; NaN if this image does not allow measuring it.
     double correlation = std::numeric_limits<double>::quiet_NaN();
-    // Mean sample variance of the mean over the mean variance between the halves; NaN if unknown.
+    // The halves' variance over the sample variance, the mean of all pixels; NaN without a sample variance.
     double variance_ratio = std::numeric_limits<double>::quiet_NaN();
-    std::int64_t pixels_used = 0;
-    bool independent = false;  // false as well where nothing in the image tells
+    std::int64_t pixels_used = 0;  // for the correlation
+    bool independent = false;      // false as well where the correlation is NaN
 };
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);

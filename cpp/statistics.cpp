@@ -297,7 +297,7 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
     const bool shared = std::isnan(ratio.value) ? correlation.value > agreement
                                                 : ratio.value + 2 * ratio.standard_error < smallest_ratio;
     return {.correlation = correlation.value,
-            .variance_ratio = 1 / ratio.value,
+            .variance_ratio = ratio.value,
             .pixels_used = correlation.pixels,
             .independent = !std::isnan(correlation.value) && !mirrored && !(alike && shared)};
 }

@@ -29,18 +29,13 @@ class Defects:
 class HalvesTest:
     """Whether the noise of two half buffers is independent. Without arguments: nothing is known.
 
-    ``correlation`` is that of the halves' errors, ``variance_ratio`` the sample variance of the mean over
-    the variance between the halves (1 for independent samples); both are NaN where unknown. ``pixels_used``
-    went into ``correlation``. ``independent`` is False as well where nothing in the image tells.
+    ``correlation`` is that of the halves' errors, NaN if the image does not allow measuring it. Then
+    ``independent`` is False as well.
     """
 
     def __init__(self) -> None: ...
     @property
     def correlation(self) -> float: ...
-    @property
-    def variance_ratio(self) -> float: ...
-    @property
-    def pixels_used(self) -> int: ...
     @property
     def independent(self) -> bool: ...
 

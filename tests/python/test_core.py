@@ -205,8 +205,6 @@ def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
     independent = compare_halves(_noisy_color(96, 80))
     assert independent.independent
     assert abs(independent.correlation) < 0.1
-    assert independent.variance_ratio == pytest.approx(1, abs=0.1)
-    assert independent.pixels_used >= 96 * 80 / 3
 
     mirrored = compare_halves(_noisy_color(96, 80, mirror=0.5))
     assert not mirrored.independent
@@ -219,7 +217,8 @@ def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
     assert (copied.independent, copied.correlation) == (False, 1.0)
 
     alone = compare_halves(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
-    assert (alone.independent, alone.pixels_used) == (False, 0)
+    assert not alone.independent
+    assert np.isnan(alone.correlation)
 
 
 def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRender) -> None:
