@@ -79,7 +79,7 @@ void bind(const py::module_& module) {
 
     py::class_<Render>(module, "Render",
                        "A loaded scene that is rendered pass by pass; one at a time per process.")
-        .def(py::init([](const std::string& scene, int threads, std::optional<std::uint64_t> max_pixels,
+        .def(py::init([](const std::string& scene, int threads, std::uint64_t max_pixels,
                          std::optional<std::uint32_t> spp, std::optional<std::uint32_t> seed,
                          std::string input_directory, std::string output_directory, std::string output_file,
                          std::string hdr_output_file) {
@@ -93,7 +93,7 @@ void bind(const py::module_& module) {
                                           .output_file = std::move(output_file),
                                           .hdr_output_file = std::move(hdr_output_file)});
              }),
-             py::arg("scene"), py::kw_only(), py::arg("threads") = 0, py::arg("max_pixels") = py::none(),
+             py::arg("scene"), py::kw_only(), py::arg("threads"), py::arg("max_pixels"),
              py::arg("spp") = py::none(), py::arg("seed") = py::none(), py::arg("input_directory") = "",
              py::arg("output_directory") = "", py::arg("output_file") = "", py::arg("hdr_output_file") = "",
              py::call_guard<py::gil_scoped_release>(),

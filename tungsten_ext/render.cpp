@@ -4,7 +4,6 @@
 #include <rapidjson/stringbuffer.h>
 #include <rapidjson/writer.h>
 
-#include <algorithm>
 #include <filesystem>
 #include <future>
 #include <map>
@@ -41,13 +40,11 @@ constexpr std::uint32_t stock_seed = 0xBA5EBA11;
 
 // Tungsten's pools detach their workers when destroyed, which then read freed memory: pools are kept for
 // good.
-void use_threads(int requested) {
-    static std::map<std::uint32_t, ThreadPool*> pools;
-    const std::uint32_t threads = requested > 0 ? static_cast<std::uint32_t>(requested)
-                                                : std::max(ThreadUtils::idealThreadCount() - 1, 1u);
+void use_threads(int threads) {
+    static std::map<int, ThreadPool*> pools;
     ThreadPool*& pool = pools[threads];
     if (pool == nullptr) {
-        ThreadUtils::startThreads(static_cast<int>(threads));
+        ThreadUtils::startThreads(threads);
         pool = ThreadUtils::pool;
     }
     ThreadUtils::pool = pool;
@@ -184,7 +181,7 @@ Render::Render(const std::string& scene_path, const RenderOptions& options)
         throw std::runtime_error(one_line(error.what()));
     }
     const Vec2u size = self.scene->camera()->resolution();
-    if (options.max_pixels && std::uint64_t{size.x()} * size.y() > *options.max_pixels)
+    if (std::uint64_t{size.x()} * size.y() > options.max_pixels)
         throw PictureTooLarge(std::to_string(size.x()) + " x " + std::to_string(size.y()));
 
     RendererSettings& settings = self.scene->rendererSettings();

@@ -12,11 +12,11 @@
 
 namespace tungsten_dip {
 
-// What the stock command's flags override in the scene file; what is unset or empty stays as the scene has
-// it.
+// How to render, and what the stock command's flags override in the scene file; what is unset or empty stays
+// as the scene has it.
 struct RenderOptions {
-    int threads = 0;  // 0: number of cores minus one, as the stock command
-    std::optional<std::uint64_t> max_pixels;
+    int threads;
+    std::uint64_t max_pixels;
     std::optional<std::uint32_t> spp;
     std::optional<std::uint32_t> seed;
     std::string input_directory;
