@@ -90,15 +90,15 @@ class SceneOutputs:
 
 
 def scene_outputs(
-    scene: Scene, input_directory: Path, output_directory: Path | None, ldr: Path | None, hdr: Path | None
+    scene: Scene, output_directory: Path | None, ldr: Path | None, hdr: Path | None
 ) -> SceneOutputs:
     """Decide where a scene's files go; the last three arguments are the command line's, None if not given.
 
-    The scene's names are relative to its ``output_directory``, that to ``input_directory``. The command
-    line's names are relative to its output directory, or else to the working directory.
+    The scene's names are relative to its ``output_directory``, that to the folder of the files it
+    names. The command line's names are relative to its output directory, or else to the working directory.
     """
     renderer = scene.renderer
-    folder = output_directory or input_directory / renderer.output_directory
+    folder = output_directory or (scene.input_directory or scene.path.parent) / renderer.output_directory
     own_folder = output_directory or Path()
 
     def placed(own: Path | None, name: str) -> Path | None:

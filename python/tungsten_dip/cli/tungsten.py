@@ -59,9 +59,9 @@ def write_outputs(
     buffers: RenderBuffers,
     outputs: SceneOutputs,
     tonemap: TonemapName,
-    report: Path | None = None,
-    remarks: Sequence[str] = (),
-    save_model: Path | None = None,
+    report: Path | None,
+    remarks: Sequence[str],
+    save_model: Path | None,
 ) -> None:
     """Write a denoised render beside its own files.
 
@@ -203,7 +203,7 @@ def _render_scene(
     Raises InputError if the scene would write over one of those, or as whatever is called here does.
     """
     scene = load_scene(path, options.input_directory)
-    outputs, files = _checked_outputs(scene, path, options, written)
+    outputs, files = _checked_outputs(scene, options, written)
     with remarks_from_log() as remarks:
         with progress_on_stderr(f"rendering {path.name}") as progress:
             if host == "tungsten":
@@ -221,7 +221,7 @@ def _render_scene(
 
 
 def _checked_outputs(
-    scene: Scene, path: Path, options: argparse.Namespace, written: set[Path]
+    scene: Scene, options: argparse.Namespace, written: set[Path]
 ) -> tuple[SceneOutputs, set[Path]]:
     """Return what a scene writes, and all its files, with what is made of the render.
 
@@ -231,7 +231,6 @@ def _checked_outputs(
         options.output_directory.mkdir(parents=True, exist_ok=True)
     outputs = scene_outputs(
         scene,
-        options.input_directory or path.parent,
         options.output_directory,
         options.output_file,
         options.hdr_output_file,
@@ -254,8 +253,8 @@ def _checked_outputs(
     overwritten = written & (rendered | derived)
     if overwritten:
         raise InputError(
-            f"{path}: would write over {min(overwritten)}, which belongs to a scene before; give every scene "
-            f"file names of its own"
+            f"{scene.path}: would write over {min(overwritten)}, which belongs to a scene before; give every "
+            "scene file names of its own"
         )
     if options.report is not None:
         check_writable(options.report, (".html",))

@@ -84,7 +84,7 @@ def denoise_on_cluster(
 
 
 def _done(
-    client: Any, frames: list[Frame], run: Run, models: Models | None
+    client: Any, frames: list[Frame], run: Run, models: Models
 ) -> Iterator[tuple[list[Record], Models | None, list[str]]]:
     """Yield records as they come, the first frames' with their networks, and what the worker logged."""
     from distributed import as_completed
@@ -119,9 +119,7 @@ def _done(
             yield [*records, *(failed(frame, task.exception()) for frame in to_do)], None, []
 
 
-def _denoise_frames(
-    frames: list[Frame], run: Run, models: Models | None
-) -> tuple[list[Record], Models, list[str]]:
+def _denoise_frames(frames: list[Frame], run: Run, models: Models) -> tuple[list[Record], Models, list[str]]:
     """Return the records and networks of frames, and what was logged, which nobody would see on a worker."""
     with remarks_from_log() as remarks:
         return *denoise_frames(frames, run, models), remarks

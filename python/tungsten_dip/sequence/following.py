@@ -77,7 +77,7 @@ class _Last:
 class Follower:
     """Denoises frames in their order. ``models`` are the networks so far."""
 
-    def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models | None = None) -> None:
+    def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models = Models()) -> None:
         """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
 
         Raises InputError if the settings are those of the published method, which has no halves to follow,
@@ -87,7 +87,7 @@ class Follower:
             raise InputError(f"refit: expected auto or a number from 0 to {_MOST_REFIT}, got {refit!r:.40}")
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
-        self.models = models or Models()
+        self.models = models
         check_ready(settings, self.models.first)
         self._settings = settings
         self._refit = refit
