@@ -149,14 +149,25 @@ def _parser() -> argparse.ArgumentParser:
     add("-v", "--version", action="version", version=f"tungsten, version {tungsten_dip.__version__}")
     add("-t", "--threads", metavar="N", type=int, help="number of threads")
     add("-r", "--restart", action="store_true", help="ignore saved render checkpoints and start from 0 spp")
-    add("-c", "--checkpoint", metavar="S", type=minutes, help="render time between checkpoints; 0: none")
+    add(
+        "-c",
+        "--checkpoint",
+        metavar="TIME",
+        type=minutes,
+        help="minutes between checkpoints, or 90s, 2h; 0: none",
+    )
     add("-i", "--input-directory", metavar="DIR", type=Path, help="where the files of the scenes are")
     add("-d", "--output-directory", metavar="DIR", type=Path, help="where output goes; made if need be")
     add("--spp", metavar="N", type=int, help="samples per pixel in place of the scene's")
-    add("--timeout", metavar="S", type=minutes, help="maximum render time in minutes, or 90s, 2h; 0: none")
+    add(
+        "--timeout",
+        metavar="TIME",
+        type=minutes,
+        help="render for so many minutes at most, or 90s, 2h; 0: no limit",
+    )
     add("-s", "--seed", metavar="N", type=int, help="random seed of the render")
     add("-o", "--output-file", metavar="FILE", type=Path, help="PNG in place of the scene's output_file")
-    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR or PFM in place of the scene's")
+    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR, PFM or HDR in place of the scene's")
     add(
         "--host",
         choices=get_args(Host),
