@@ -21,6 +21,7 @@ from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
+from tungsten_dip.buffers.model import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.paper.constants import ITERATIONS
@@ -132,11 +133,12 @@ def run_paper_table(
     if iterations < 1:
         raise InputError(f"iterations: expected a number above 0, got {iterations}")
     runner = Runner(folder, threads)
+    buffers = prepared(bench_set.buffers, threads=threads).buffers
     chosen = [
         row
         for row in published
         if (rows is None or row.number in rows)
-        and _can_be_fitted(bench_set, row, row.settings(iterations, threads))
+        and _can_be_fitted(buffers, row, row.settings(iterations, threads))
     ]
     methods = {row.number: _row_method(bench_set, row, iterations, threads) for row in chosen}
     curve = _curve_method(bench_set, iterations, threads)
@@ -162,9 +164,9 @@ def run_paper_table(
     return text
 
 
-def _can_be_fitted(bench_set: BenchSet, row: PublishedRow, settings: FitSettings) -> bool:
+def _can_be_fitted(buffers: RenderBuffers, row: PublishedRow, settings: FitSettings) -> bool:
     try:
-        paper_images(prepared(bench_set.buffers, threads=settings.threads).buffers, settings)
+        paper_images(buffers, settings)
     except InputError as error:
         _LOG.warning("row %d is left out: %s", row.number, error)
         return False
