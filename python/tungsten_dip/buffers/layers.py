@@ -107,6 +107,12 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
     return Found(channels, ignored)
 
 
+def planes_of_output(two_buffer_variance: bool, sample_variance: bool) -> list[str]:
+    """Return the planes that Tungsten writes of a buffer with these settings."""
+    halves = ["half_a", "half_b"] if two_buffer_variance else []
+    return ["mean", *halves, *(["variance"] if sample_variance else [])]
+
+
 def check_no_chroma(color: Iterable[str], channel_names: Iterable[str]) -> None:
     """Raise InputError if the channels of the colour are luminance, and others of the file its chroma."""
     if "Y" in map(str.upper, color) and {"RY", "BY"} <= set(channel_names):

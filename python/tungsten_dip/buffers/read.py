@@ -30,6 +30,7 @@ from tungsten_dip.buffers.layers import (
     find_layers,
     mapped_channels,
     names_quantity,
+    planes_of_output,
 )
 from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
@@ -162,12 +163,9 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
                 ignored.append(f"output buffer {quantity} without hdr_output_file or of unknown type")
                 continue
             file = with_known_suffix(folder / name, radiance_suffixes(quantity))
-            wanted = [""]
-            wanted += ["A", "B"] if request.get("two_buffer_variance", False) else []
-            wanted += ["Variance"] if request.get("sample_variance", False) else []
-            files |= {
-                quantity + suffix: file.with_name(file.stem + suffix + file.suffix) for suffix in wanted
-            }
+            settings = request.get("two_buffer_variance", False), request.get("sample_variance", False)
+            for suffix in (PLANES[plane] for plane in planes_of_output(*settings)):
+                files[quantity + suffix] = file.with_name(file.stem + suffix + file.suffix)
         if "color" not in files and renderer.get("hdr_output_file"):
             picture = with_known_suffix(folder / renderer["hdr_output_file"])
             if files and not renderer.get("overwrite_output_files", True):

@@ -13,6 +13,7 @@ import numpy as np
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
+from tungsten_dip.buffers.layers import planes_of_output
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName
@@ -176,10 +177,9 @@ def _write(path: Path, image: FloatImage) -> None:
 
 def _files_of(request: OutputBuffer) -> Iterator[tuple[str, Path]]:
     """Yield the plane and the path of every file of a buffer."""
-    for plane, suffix in PLANES.items():
-        if {"mean": True, "variance": request.sample_variance}.get(plane, request.two_buffer_variance):
-            for path in map(Path, filter(None, (request.hdr_output_file, request.ldr_output_file))):
-                yield plane, path.with_name(path.stem + suffix + path.suffix)
+    for plane in planes_of_output(request.two_buffer_variance, request.sample_variance):
+        for path in map(Path, filter(None, (request.hdr_output_file, request.ldr_output_file))):
+            yield plane, path.with_name(path.stem + PLANES[plane] + path.suffix)
 
 
 def _path(name: str) -> Path | None:
