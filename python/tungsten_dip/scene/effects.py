@@ -205,13 +205,11 @@ def _reasons_without_information(scene: Scene, effects: Effects) -> dict[Quantit
 
 
 def _written_albedos(surface: Primitive) -> Iterator[Texture]:
-    """Yield what Tungsten writes as albedo: that of the outermost BSDF, or of the base of a transparency."""
+    """Yield what Tungsten writes as albedo, unless the path goes on to what a specular surface shows."""
     bsdfs = surface.bsdf if isinstance(surface, Mesh) else (getattr(surface, "bsdf", None),)
     for bsdf in bsdfs:
-        if isinstance(bsdf, TransparencyBsdf):
-            yield bsdf.base.albedo
-        elif isinstance(bsdf, Bsdf) and not isinstance(bsdf, _ALWAYS_SPECULAR):
-            yield bsdf.albedo
+        if isinstance(bsdf, Bsdf) and not isinstance(bsdf, _ALWAYS_SPECULAR):
+            yield bsdf.written_albedo
 
 
 def _primitives(scene: Scene) -> Iterator[Primitive]:

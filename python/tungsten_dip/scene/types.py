@@ -367,6 +367,11 @@ class Bsdf:
     albedo: Texture = ConstantTexture(value=(1.0, 1.0, 1.0))
     bump: Texture | None = None
 
+    @property
+    def written_albedo(self) -> Texture:
+        """What Tungsten writes into the albedo buffer, whatever the BSDF does with it."""
+        return self.albedo
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LambertBsdf(Bsdf):
@@ -518,6 +523,11 @@ class TransparencyBsdf(Bsdf):
     kind: ClassVar[str] = "transparency"
     base: Bsdf = LambertBsdf()
     alpha: Texture = ConstantTexture(value=(1.0, 1.0, 1.0))
+
+    @property
+    def written_albedo(self) -> Texture:
+        """That of ``base``."""
+        return self.base.albedo
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -65,7 +65,7 @@ def bsdf_object(
             "consistent": t.source.integrator.enable_consistency_checks,
         }
     built = t.add("bsdf", node)
-    t.albedo[built.id()] = texture_node(t, _feature_albedo(bsdf), "rgb", uv)
+    t.albedo[built.id()] = texture_node(t, bsdf.written_albedo, "rgb", uv)
     t.place = outer
     return t.remember(key, built)
 
@@ -78,11 +78,6 @@ def height_map(bsdf: ts.Bsdf) -> ts.Texture | None:
 
 def _named(bsdf: ts.Bsdf) -> str:
     return f'bsdf "{bsdf.name}"' if bsdf.name else f"bsdf of type {bsdf.kind}"
-
-
-def _feature_albedo(bsdf: ts.Bsdf) -> ts.Texture:
-    """What Tungsten writes into the albedo buffer: the BSDF's own albedo, whatever it does with it."""
-    return bsdf.base.albedo if isinstance(bsdf, ts.TransparencyBsdf) else bsdf.albedo
 
 
 def _transmits(bsdf: ts.Bsdf) -> bool:
