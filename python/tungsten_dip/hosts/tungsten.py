@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, RenderBuffers
+from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.hosts.native import BUILD_HINT, executable, render_in_child
+from tungsten_dip.hosts.options import RANGES, checked_option
 from tungsten_dip.interrupts import requested_interrupts
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import TonemapName
@@ -53,10 +54,10 @@ class DriverOptions:
     hdr_output_file: Path | None = None
 
     def __post_init__(self) -> None:
-        for name, least, most in (("threads", 1, 2**31 - 1), ("spp", 1, MOST_SPP), ("seed", 0, 2**32 - 1)):
+        for name in RANGES:
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, whole_number(name, value, least, most))
+                object.__setattr__(self, name, checked_option(name, value))
 
 
 @dataclass(frozen=True)

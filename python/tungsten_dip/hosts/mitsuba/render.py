@@ -15,18 +15,27 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, Quantity, RenderBuffers
+from tungsten_dip.buffers.model import (
+    CHANNELS,
+    FEATURES,
+    MOST_SPP,
+    Buffer,
+    FloatImage,
+    Quantity,
+    RenderBuffers,
+)
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
+from tungsten_dip.hosts.options import checked_option
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.types import Scene
 
 _LOG = logging.getLogger(__name__)
 
-QUANTITIES: tuple[Quantity, ...] = ("color", "albedo", "normal", "depth")
+QUANTITIES: tuple[Quantity, ...] = ("color", *FEATURES)
 """What is rendered unless something else is asked for; colour is always there."""
 
 _POLL_S = 0.1
@@ -99,10 +108,10 @@ def render_translated(
     With ``timeout_s`` the picture is rendered in passes of ``spp_step``, and no pass begins after that time;
     at least one is rendered, and the buffers tell the spp that were reached.
     """
-    spp = whole_number("spp", spp, 1, MOST_SPP)
+    spp = checked_option("spp", spp)
     spp_step = whole_number("spp_step", spp_step, 1, MOST_SPP)
-    threads = None if threads is None else whole_number("threads", threads, 1, 2**31 - 1)
-    seed = whole_number("seed", seed, 0, 2**32 - 1)
+    threads = None if threads is None else checked_option("threads", threads)
+    seed = checked_option("seed", seed)
     started = time.perf_counter()
     with mitsuba_variant() as mitsuba:
         try:

@@ -1,0 +1,13 @@
+"""The numbers that every host takes."""
+
+from __future__ import annotations
+
+from tungsten_dip.buffers.model import MOST_SPP
+from tungsten_dip.errors import whole_number
+
+RANGES = {"spp": (1, MOST_SPP), "seed": (0, 2**32 - 1), "threads": (1, 2**31 - 1)}
+
+
+def checked_option(name: str, value: int) -> int:
+    """Return one of the numbers as Python's own; raise InputError if it is out of its range."""
+    return whole_number(name, value, *RANGES[name])
