@@ -61,7 +61,7 @@ def environment_node(t: Translation, primitive: Surrounding) -> Node | None:
 
 
 def default_environment() -> Node:
-    """Return what Tungsten lights a scene with that has no light: white from everywhere."""
+    """Return the white sky that Tungsten adds to a scene without lights."""
     return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
 
 
@@ -92,7 +92,13 @@ def envmap_node(
     rows = np.empty((2 * len(pixels) + 1, *pixels.shape[1:]))
     rows[1::2] = pixels
     rows[0::2] = 0.5 * (padded[:-1] + padded[1:])
-    return _envmap(rows, rotation)
+    to_world = np.eye(4)
+    to_world[:3, :3] = rotation @ _ENVMAP_AXES
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(rows, dtype=np.float32)),
+        "to_world": transform(to_world),
+    }
 
 
 def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node | None:
@@ -109,16 +115,6 @@ def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -
         "direction": [float(x) for x in primitive.world_from_local[:3, 1]],
         "cap_angle": angle,
         "radiance": texture_node(t, texture, "rgb", scale=scale),
-    }
-
-
-def _envmap(rows: npt.NDArray[np.float64], rotation: npt.NDArray[np.float64]) -> Node:
-    to_world = np.eye(4)
-    to_world[:3, :3] = rotation @ _ENVMAP_AXES
-    return {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(rows, dtype=np.float32)),
-        "to_world": transform(to_world),
     }
 
 
