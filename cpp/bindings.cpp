@@ -1,4 +1,4 @@
-// The Python module _core: the one file that knows pybind11. Arrays are shared with numpy, never converted;
+// The Python module _core: the one file that uses pybind11. Arrays are shared with numpy, never converted;
 // their types and shapes are checked here, all else by the core.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>

@@ -1,5 +1,5 @@
-// The core of tungsten-dip: the buffers of a render, how they are mended, what is known of their noise, and
-// the pre-filtering of features. Free of Python and of any renderer.
+// The core of tungsten-dip: the buffers of a render, how they are mended, what is known of their noise, the
+// filters of features and pilots, and a layer of the published networks. Free of Python and of any renderer.
 //
 // Images are float32, C-contiguous, shape (height, width, channels), row 0 at the top; colour is linear
 // radiance. `threads` 0 uses every core; no result depends on it, to the bit.
@@ -172,14 +172,14 @@ void regress(ConstImage target, ConstImage features, const float* penalty, Const
 // --- steering.cpp
 
 // The products of the features' gradients, summed over features and smoothed: channels xx, yy, xy (Foerstner
-// and Guelch 1987), shape (height, width, 3). It tells the direction of edges.
+// and Guelch 1987), shape (height, width, 3). It holds the direction of edges.
 void structure_tensor(ConstImage features, Image out, int threads);
 
-// Averages an image along the edges that a structure tensor of its size tells: around every pixel by a
-// Gaussian with standard deviations `along` and `across` (in pixels) the edge (Feng and Milanfar 2002,
-// "Multiscale principal components analysis for image local orientation estimation"; Takeda et al. 2007,
-// "Kernel Regression for Image Processing and Reconstruction"). Neighbours with another tensor, as beyond the
-// end of the edge, weigh less.
+// Averages an image along the edges of a structure tensor of its size: around every pixel by a Gaussian with
+// standard deviations `along` and `across` (in pixels) the edge (Feng and Milanfar 2002, "Multiscale
+// principal components analysis for image local orientation estimation"; Takeda et al. 2007, "Kernel
+// Regression for Image Processing and Reconstruction"). Neighbours with another tensor, as beyond the end of
+// the edge, weigh less.
 void smooth_along_edges(ConstImage image, ConstImage tensor, float along, float across, Image out,
                         int threads);
 

@@ -269,7 +269,7 @@ class TileFilter {
     }
 };
 
-// The variance of one half: twice that of the mean, which the halves tell roughly where it is not known.
+// The variance of one half: twice that of the mean, which the halves estimate roughly where it is not known.
 void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
     ConstImage of_mean = in.variance;
     if (!of_mean.known()) {

@@ -139,7 +139,7 @@ void fill_from_neighbours(const Image& image, std::vector<Position> pending, con
     }
 }
 
-// Fills what is left with the values of another image, and with 0 where that knows nothing either.
+// Fills what is left with the values of another image, and with 0 where that is empty, too.
 void fill_from_other(const Image& image, const std::vector<Position>& pending, const Image& other) {
     for (const Position at : pending) {
         float& value = image.at(at.y, at.x, at.c);

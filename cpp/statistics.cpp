@@ -1,4 +1,4 @@
-// What the halves of a render and its sample variance tell of its noise.
+// What the halves of a render and its sample variance show of its noise.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -25,7 +25,7 @@ constexpr int tile_size = 8;
 constexpr std::array<double, 3> stencil{1, -2, 1};  // along both axes
 
 // Where D is below this part of the tile's energy the halves agree up to the rounding of half floats (noise
-// of less than about 0.05% of the radiance), which tells nothing.
+// of less than about 0.05% of the radiance), which shows nothing.
 constexpr double rounding = 5e-6;
 
 // The standard deviation of one tile's ratio; 0.18 to 0.21 was measured on path-traced images of 4 to 32 spp.
@@ -123,7 +123,7 @@ Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
         result.pixels += tile.pixels;
     }
     result.value = median(ratios);
-    // 1.25 = sqrt(pi / 2): how much less a median of normal values knows than their mean.
+    // 1.25 = sqrt(pi / 2): the standard error of a median of normal values over that of their mean.
     result.standard_error = 1.25 * tile_spread / std::sqrt(static_cast<double>(tiles.size()));
     return result;
 }

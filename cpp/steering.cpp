@@ -1,5 +1,5 @@
 // Smoothing along the edges of features, with Gaussians that the structure tensor steers: few samples saw how
-// much of a pixel each surface covers, and those of its neighbours along the edge tell more.
+// much of a pixel each surface covers, and those of its neighbours along the edge add to it.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -151,7 +151,7 @@ TUNGSTEN_DIP_FASTEST int measure_offset(const Gaussians& gaussians, float dx, fl
 }
 
 // weights = exp(-distance). The line that an edge follows goes on where the edge itself ends: the difference
-// of the tensors tells.
+// of the tensors shows that.
 TUNGSTEN_DIP_FASTEST void weigh_offset(const Gaussians& gaussians, const TensorRow& tensor,
                                        const TensorRow& other, float* weights) {
     for (int i = 0; i < gaussians.count; ++i) {

@@ -1,4 +1,4 @@
-// What Tungsten's thin lens knows beyond Mitsuba's: a polygon for an aperture, and a second diaphragm that
+// What Tungsten's thin lens has beyond Mitsuba's: a polygon for an aperture, and a second diaphragm that
 // cuts off what comes in at an angle, so that highlights towards the edge of the picture look like a cat's
 // eye.
 #pragma once

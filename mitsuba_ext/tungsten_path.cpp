@@ -177,7 +177,7 @@ class ByQuantity {
     std::array<T, tungsten_dip::quantity_names.size()> values_{};
 };
 
-// What one camera ray tells: a quantity that it says nothing of stays empty and is not averaged.
+// What one camera ray records: a quantity that it says nothing of stays empty and is not averaged.
 class Sample {
   public:
     void set(Quantity quantity, const Vector3& value) {

@@ -1,4 +1,4 @@
-// Where Tungsten's camera keeps what it knows of an image, and how to get at it without changing Tungsten.
+// Where Tungsten's camera keeps the data of an image, and how to get at it without changing Tungsten.
 #pragma once
 
 #include <cstdint>

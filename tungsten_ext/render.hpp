@@ -37,7 +37,7 @@ struct QuantityPlanes {
     float* variance = nullptr;
 };
 
-// What one render knows. `memory` owns every array; `spp` is null where every pixel has `uniform_spp`
+// What is known of a render. `memory` owns every array; `spp` is null where every pixel has `uniform_spp`
 // samples.
 struct RenderBuffers {
     int width;

@@ -99,7 +99,7 @@ RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
                           .memory = owner};
 
     if (!features) {
-        // Light also arrives by splatting, which no half knows of: only the whole image is sound.
+        // Light also arrives by splatting, which no half contains: only the whole image is sound.
         float* mean = memory.own(std::move(means[0]));
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
             for (std::uint32_t i = begin; i < end; ++i) {

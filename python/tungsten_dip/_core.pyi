@@ -1,9 +1,9 @@
 """The core in C++. Arrays are float32, C-contiguous, aligned, (height, width, channels), never modified.
 
-Every function raises TypeError for another dtype (those of bfloat16 for another layout, too) and ValueError
-for another shape or layout or a number that it does not take; none converts.
-Inputs are read in place, also read-only ones. The interpreter lock is released during long work.
-``threads`` 0 uses every core; no result depends on it.
+Every function raises TypeError for arrays of another dtype (those of bfloat16 for another layout, too), and
+ValueError for another shape or layout or a number out of range. Nothing is converted. Inputs are read in
+place, also read-only ones. The interpreter lock is released during long work. ``threads`` 0 uses every core;
+no result depends on it.
 """
 
 from collections.abc import Sequence

@@ -15,7 +15,7 @@ def check_type(what: str, value: Any, expected: type, remedy: str) -> None:
 
 
 def whole_number(what: str, value: Any, least: int, most: int) -> int:
-    """Return a number, perhaps of numpy's, which neither JSON nor a renderer knows, as Python's own.
+    """Return a number, perhaps of numpy's, which neither JSON nor a renderer takes, as Python's own.
 
     Raises InputError if it is no whole number of this range.
     """

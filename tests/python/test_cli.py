@@ -424,7 +424,7 @@ def test_denoised_pictures_lie_beside_the_noisy_ones(tmp_path, renders, fits, ca
 def test_pictures_of_unknown_types_are_written_as_known_ones(tmp_path, renders, caplog):
     buffers = [
         {"type": "albedo", "hdr_output_file": "albedo.hdr"},
-        {"type": "normal", "hdr_output_file": "normal.hdr"},  # which knows no sign
+        {"type": "normal", "hdr_output_file": "normal.hdr"},  # which holds no sign
         {"type": "depth", "hdr_output_file": "depth.tif"},
     ]
     scene = write_scene(

@@ -228,7 +228,7 @@ def test_an_error_that_cannot_be_known_is_refused_before_the_work(
     rest = [str(tmp_path / "in"), "-o", str(tmp_path / "out.exr"), "--error-map", str(tmp_path / "e.exr")]
     for first in (["denoise", "--preset", "paper"], ["infer", str(tmp_path / "paper.onnx")]):
         assert command.main([*first, *rest]) == 2
-        assert "--error-map: the published method knows no error" in capfd.readouterr().err
+        assert "--error-map: the published method estimates no error" in capfd.readouterr().err
     assert not (tmp_path / "out.exr").exists()
 
 

@@ -96,7 +96,7 @@ def _end(target: Path) -> str:
 
 @contextmanager
 def _locked_temporary(target: Path) -> Iterator[Path]:
-    """Create a temporary file and hold the lock that tells that its writer lives; remove it on leaving."""
+    """Create a temporary file and hold the lock that shows that its writer lives; remove it on leaving."""
     while True:
         temporary = _temporary(target)
         try:

@@ -12,7 +12,7 @@ from tungsten_dip.cores import thread_count
 __all__ = ["HalvesTest", "compare_halves", "without_foreign_halves"]
 
 _UNEQUAL = 0.5
-"""How far a pixel may lie from (A + B) / 2, in units of |A - B| / 2: of one and two samples it is 1/3."""
+"""How far a pixel may lie from (A + B) / 2, over |A - B| / 2. Halves of one and of two samples give 1/3."""
 
 _ROUNDED = 2e-3
 """Relative difference that rounding to 16 bits explains."""

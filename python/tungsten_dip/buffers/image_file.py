@@ -57,7 +57,7 @@ _ENCODING = {
 
 
 def radiance_suffixes(quantity: Quantity) -> tuple[str, ...]:
-    """Return the formats that hold a quantity, in the order of preference: .hdr knows no sign."""
+    """Return the formats that hold a quantity, in the order of preference: .hdr holds no sign."""
     return tuple(suffix for suffix in RADIANCE_SUFFIXES if quantity != "normal" or suffix != ".hdr")
 
 
@@ -209,7 +209,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         message = output.geterror()
         if not (written and closed) or message:
             raise OSError(_one_line(message))
-        # Or not at all: the last block is written by a close that tells nobody.
+        # Or not at all: the last block is written by a close that reports no error.
         _decoded(temporary)
         if suffix == ".png" and not temporary.read_bytes().endswith(_PNG_END):
             raise OSError("the end of the file is missing")

@@ -45,7 +45,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 LINE_INTERVAL_S = 5.0
-"""How often progress is told where there is no terminal to draw a bar on."""
+"""How often progress is reported where there is no terminal to draw a bar on."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -53,7 +53,7 @@ def fit_settings(
 ) -> FitSettings:
     """Return the settings (a model's, to start from it) with those of the named options that were given."""
     if warm_start is not None and options.preset not in (None, warm_start.settings.preset):
-        # Told here: what else the model leaves open may be nothing that this preset knows.
+        # Reported here: what else the model leaves open may be nothing that this preset has.
         check_settings(warm_start, FitSettings(options.preset))
     settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     given = {name: getattr(options, name) for name in names}

@@ -37,7 +37,7 @@ def _leaving_on_interrupt(command: str) -> Iterator[None]:
     if before is signal.SIG_IGN:
         # As of a process in the background; Mitsuba, which has a handler of its own, shall not see it either.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    if before in (signal.SIG_IGN, None):  # None is a handler that Python does not know
+    if before in (signal.SIG_IGN, None):  # None is a handler that was not set from Python
         yield
         return
     signal.signal(signal.SIGINT, leave)

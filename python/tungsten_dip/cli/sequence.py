@@ -130,7 +130,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[Path]:
-    """Yield what is read of all frames; of those that cannot be read the run itself tells."""
+    """Yield what is read of all frames; those that cannot be read, the run itself reports."""
     for frame in frames:
         with suppress(InputError):
             yield from (file.resolve() for file in input_files(frame.input, mapping))
@@ -138,7 +138,7 @@ def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[P
 
 @contextmanager
 def _without_repetition() -> Iterator[None]:
-    """Keep back what was told of an earlier frame in the same words."""
+    """Keep back what was reported of an earlier frame in the same words."""
     told: set[str] = set()
 
     def is_new(record: logging.LogRecord) -> bool:

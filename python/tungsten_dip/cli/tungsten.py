@@ -189,7 +189,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _stock_arguments(arguments: Sequence[str]) -> list[str]:
-    """Return the command line without ``--host``, which the stock command does not know."""
+    """Return the command line without ``--host``, which the stock command does not have."""
     stock, rest = [], iter(arguments)
     for argument in rest:
         if argument == "--host":

@@ -182,7 +182,7 @@ def _denoised(
 ) -> tuple[dict[str, Any], str]:
     """Read the buffers, denoise them, write all that the options ask for."""
     if preset == "paper" and options.error_map is not None:
-        raise InputError("--error-map: the published method knows no error; use another preset")
+        raise InputError("--error-map: the published method estimates no error; use another preset")
     suffixes = {"output": ".exr", "error_map": ".exr", "report": ".html", "save_model": ".onnx"}
     for name, suffix in suffixes.items():
         if getattr(options, name) is not None:

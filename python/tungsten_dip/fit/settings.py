@@ -24,12 +24,13 @@ _MOST_CHANNELS = 4096
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of one fit. None means: as the preset has it.
+    """Settings of one fit.
 
     ``pilot`` names a pre-trained denoiser whose image is one more pilot, a candidate that the halves score
     like the others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and
     ``channels`` describe the network of the published method and are used by the preset ``paper`` alone.
-    ``target_error`` is a relMSE (epsilon 0.01). ``threads`` None uses every core.
+    ``target_error`` is a relMSE (epsilon 0.01). ``iterations`` None means: as the preset has
+    it. ``threads`` None uses every core. A time or an error that is None does not end the fit.
 
     Raises InputError if a name is none of those listed, or a number out of its range.
     """

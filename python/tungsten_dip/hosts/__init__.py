@@ -53,7 +53,7 @@ def render(
     _LOG.info("%s: rendered by %s", path, host.capitalize())
     with _RENDERING:
         if host == "tungsten":
-            # Which may know more than `load_scene`.
+            # Which may read scenes that `load_scene` refuses.
             return tungsten.render(
                 path, spp=spp, seed=seed, threads=threads, input_directory=folder, progress=progress
             )

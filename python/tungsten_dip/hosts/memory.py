@@ -1,4 +1,4 @@
-"""Refuses a picture that does not fit into memory before a host begins, which the system would end."""
+"""Refuses a render that would run out of memory, before it starts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def check_fits_mitsuba(scene: Scene, quantities: Sequence[Quantity]) -> None:
 
 
 def _available_bytes() -> int | None:
-    """Return what Linux can hand out without swapping; None on systems that do not tell."""
+    """Return what Linux can hand out without swapping; None on systems that do not report it."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:

@@ -97,7 +97,7 @@ class _Network(GraphBuilder):
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
     def skip(self, inputs: int, outputs: int, channels: tuple[int, ...]) -> None:
-        """Encoder and decoder, as `tungsten_dip.fit.paper.networks.Skip` with its defaults."""
+        """Encoder and decoder, as `tungsten_dip.fit.paper.networks.Skip`."""
         scales = len(channels)
         sources, deeper = (inputs, *channels[:-1]), (*channels[1:], channels[-1])
         x = self.mirrored("inputs", 2**scales, at_least=2 ** (scales + 1))
@@ -137,7 +137,7 @@ class _Network(GraphBuilder):
         self.cropped(self.add("Sigmoid", self.conv(x, "head", channels[0], outputs)))
 
     def resnet(self, inputs: int, outputs: int) -> None:
-        """Residual blocks, as `tungsten_dip.fit.paper.networks.ResNet` with its defaults."""
+        """Residual blocks, as `tungsten_dip.fit.paper.networks.ResNet`."""
         width = RESNET_WIDTH
         x = self.padded(self.mirrored("inputs", 1, at_least=2), "reflect")
         x = self.leaky(self.conv(x, "first", inputs, width, size=3))

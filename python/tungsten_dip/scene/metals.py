@@ -1,4 +1,4 @@
-"""The metals (and a few other solids) that Tungsten knows by name.
+"""The metals (and a few other solids) that Tungsten has by name.
 
 Complex indices of refraction eta + i k, weighted to linear RGB, from E. F. Schubert, "Refractive index and
 extinction coefficient of materials" (2004).

@@ -2,8 +2,8 @@
 
 Where the cameras are known, what the previous frame's result shows of the next is moved into place and guides
 it (`reprojection`): then few pilots are enough, a network of its own chooses among them, and noise averages
-out over the frames. Otherwise a frame has the first one's pilots, and starts from its network. A cut is told
-by the features (little of the previous frame is in sight) or by the error, and fitted anew.
+out over the frames. Otherwise a frame has the first one's pilots, and starts from its network. A cut is
+detected by the features (little of the previous frame is in sight) or by the error, and fitted anew.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ class _CutError(Exception):
 
 
 def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int | None) -> Halves | None:
-    """Return what the last frame shows of this one, None where that cannot be told."""
+    """Return what the last frame shows of this one, None where that is not known."""
     if camera is None or last.camera is None or last.result.halves is None:
         return None
     if buffers.depth is None or last.buffers.depth is None:
@@ -200,7 +200,7 @@ def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: 
 
 
 def _typical_error(result: FitResult) -> float | None:
-    """Return the median error of the pixels that have any: no few outliers tell of a cut."""
+    """Return the median error of the pixels that have any: a few outliers make no cut."""
     if result.error is None:
         return None
     errors = result.error[result.error > 0]
@@ -208,7 +208,7 @@ def _typical_error(result: FitResult) -> float | None:
 
 
 def _flicker(last: _Last, buffers: RenderBuffers, result: FitResult) -> float | None:
-    """Return the flicker that the halves tell, None unless those of both frames are the renderer's."""
+    """Return the flicker as the halves show it, None unless those of both frames are the renderer's."""
     color, before = buffers.color, last.buffers.color
     if result.halves is None or last.result.halves is None:
         return None

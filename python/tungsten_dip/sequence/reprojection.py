@@ -78,7 +78,7 @@ def reproject(
     shape = current.color.mean.shape
     depth = current.depth.mean[:, :, 0]
     points = _points(camera, depth)
-    # Light is moved without the albedo, which the current frame knows more sharply. Of that, each half takes
+    # Light is moved without the albedo, which the current frame has more sharply. Of that, each half takes
     # its own: errors that it shared with the half which scores it would pass for truth.
     images = [
         (half / albedo).reshape(-1, 3) for half, albedo in zip(halves, _divisors(previous), strict=True)

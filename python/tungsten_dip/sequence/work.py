@@ -127,7 +127,7 @@ def denoise_frames(
 
 
 def _denoise(frame: Frame, run: Run, follower: Follower, beside: bool, progress: Progress) -> Record:
-    """Denoise and write a frame; ``beside`` tells that the follower's last one is the one before it."""
+    """Denoise and write a frame; ``beside``: whether the follower's last one is the one before it."""
     started = time.perf_counter()
     key = _key(frame, run)
     buffers = read_buffers(frame.input, run.mapping)
@@ -158,7 +158,7 @@ def failed(frame: Frame, error: Exception) -> Record:
 
 
 def _key(frame: Frame, run: Run) -> str:
-    """Return what tells whether a result is of this input, these settings and this version.
+    """Return what shows whether a result is of this input, these settings and this version.
 
     Raises InputError if the input is missing.
     """

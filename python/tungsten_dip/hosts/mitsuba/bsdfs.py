@@ -71,7 +71,7 @@ def bsdf_object(
 
 
 def height_map(bsdf: ts.Bsdf) -> ts.Texture | None:
-    """Return what bends the surface, if anything does: Tungsten knows the slopes of bitmaps alone."""
+    """Return what bends the surface, if anything does: Tungsten computes the slopes of bitmaps alone."""
     flat = ts.ConstantTexture | ts.CheckerTexture | ts.DiskTexture | ts.BladeTexture
     return None if isinstance(bsdf.bump, flat) else bsdf.bump
 

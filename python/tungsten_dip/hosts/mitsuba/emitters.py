@@ -66,7 +66,7 @@ def default_environment() -> Node:
 
 
 def together(surroundings: Sequence[tuple[Any, Surrounding]]) -> Any:
-    """Return one emitter for all lights around the scene, since Mitsuba knows but one."""
+    """Return one emitter for all lights around the scene, since Mitsuba supports only one."""
     if len(surroundings) == 1:
         return surroundings[0][0]
     node: Node = {"type": "tungsten_environments"}

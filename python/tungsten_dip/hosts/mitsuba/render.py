@@ -106,7 +106,7 @@ def render_translated(
     """Render a translated scene; `render` says what comes back and what is raised.
 
     With ``timeout_s`` the picture is rendered in passes of ``spp_step``, and no pass begins after that time;
-    at least one is rendered, and the buffers tell the spp that were reached.
+    at least one is rendered, and the buffers hold the spp that were reached.
     """
     spp = checked_option("spp", spp)
     spp_step = whole_number("spp_step", spp_step, 1, MOST_SPP)

@@ -49,7 +49,7 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
 
 
 def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
-    """Return what the integrator is told of a lens that Mitsuba's sensor does not know.
+    """Return what the integrator is given of a lens that Mitsuba's sensor does not support.
 
     Raises InputError for an aperture without counterpart.
     """

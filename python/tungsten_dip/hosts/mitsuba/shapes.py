@@ -37,7 +37,7 @@ _CYLINDER_UV = np.array([[-1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 _BENT_SHAPES: dict[type[ts.Primitive], BentShape] = {ts.Mesh: "mesh", ts.Cube: "cube", ts.Quad: "quad"}
 
 _LEAST_UV_AREA = 1e-6
-"""Twice the area in UV of a triangle below which Tungsten knows no tangents of it."""
+"""Twice the area in UV of a triangle below which Tungsten computes no tangents of it."""
 
 
 def add_shapes(t: Translation, primitive: ts.Primitive) -> bool:

@@ -11,7 +11,7 @@ from tungsten_dip.scene.types import FilterName, PathTracer
 
 @dataclass(frozen=True)
 class TranslatedScene:
-    """A scene for `mitsuba.load_dict`, and what Tungsten's integrator knows beyond it.
+    """A scene for `mitsuba.load_dict`, and what Tungsten's integrator takes beyond it.
 
     ``scene`` is a dictionary of type "scene" with one sensor and no integrator. The film's size is the
     picture's; its reconstruction filter and the sensor's sampler are not used.
@@ -22,7 +22,7 @@ class TranslatedScene:
 
     ``reconstruction_filter`` is Tungsten's, whose samples are distributed by the filter instead of weighted
     by it. ``pixel_center`` is where the filter is centred in a pixel: 0.5, but 0 for Tungsten's thin lens.
-    ``lens`` holds what the integrator is told of a thin lens beyond the sensor.
+    ``lens`` holds what the integrator is given of a thin lens beyond the sensor.
     """
 
     scene: Mapping[str, Any]
