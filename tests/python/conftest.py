@@ -7,16 +7,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from commands import write_scene
 from fitted_models import DRAFT
+from tungsten_dip.buffers import write_tungsten_folder
 from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.relmse import relative_squared_error
-from tungsten_dip.fit import FitResult, denoise
+from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.onnx import save_model
+from tungsten_dip.progress import silent
 
 SAMPLE_SHAPE = 0.5
 """Samples are gamma distributed with this shape around the true radiance: variance radiance^2 / shape."""
@@ -49,38 +54,6 @@ class SyntheticRender:
     buffers: RenderBuffers
     reference: FloatImage
 
-
-SCENE = {
-    "bsdfs": [{"name": "grey", "type": "lambert", "albedo": 0.5}],
-    "primitives": [
-        {"type": "quad", "bsdf": "grey", "transform": {"scale": 4}},
-        {"type": "infinite_sphere", "emission": [0.5, 0.7, 1.0]},
-    ],
-    "camera": {
-        "type": "pinhole",
-        "tonemap": "filmic",
-        "resolution": [17, 9],
-        "fov": 45,
-        "transform": {"position": [0, 2, 5], "look_at": [0, 0, 0], "up": [0, 1, 0]},
-    },
-    "integrator": {"type": "path_tracer", "max_bounces": 2},
-    "renderer": {
-        "output_file": "picture.png",
-        "hdr_output_file": "picture.exr",
-        "spp": 4,
-        "output_buffers": [
-            {
-                "type": "normal",
-                "hdr_output_file": "n.exr",
-                "ldr_output_file": "n.png",
-                "two_buffer_variance": True,
-                "sample_variance": True,
-            },
-            {"type": "depth", "hdr_output_file": "z.pfm"},
-        ],
-    },
-}
-"""A small scene of Tungsten's, for every test that renders by the commands."""
 
 MakeRender = Callable[..., SyntheticRender]
 
@@ -127,6 +100,63 @@ def saved(model: Model, tmp_path: Path) -> Path:
     """The file of that network."""
     save_model(tmp_path / "m.onnx", model)
     return tmp_path / "m.onnx"
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A small scene's file."""
+    return write_scene(tmp_path / "scene.json")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, render: SyntheticRender) -> Path:
+    """The synthetic render as Tungsten's buffer files."""
+    write_tungsten_folder(tmp_path / "buffers", render.buffers)
+    return tmp_path / "buffers"
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[FitSettings]:
+    """Replaces the fit by its mean colour; lists the settings that it was called with."""
+    calls = []
+
+    def mean_color(buffers, settings=None, progress=silent, warm_start=None):
+        settings = settings or FitSettings()
+        calls.append(settings)
+        os.write(1, b"a library that chatters on stdout\n")
+        progress(0.5, "halfway")
+        color = np.broadcast_to(buffers.color.mean.mean((0, 1)), buffers.color.mean.shape).copy()
+        error = np.full((buffers.height, buffers.width, 1), 0.25, np.float32)
+        known = buffers.color.halves is not None
+        return FitResult(
+            color=color,
+            settings=settings,
+            seconds=1.5,
+            iterations=7,
+            error=error if known else None,
+            estimated_relmse=0.25 if known else None,
+            history=(HistoryPoint(0.5, 3, 0.5), HistoryPoint(1.5, 7, 0.25)),
+        )
+
+    monkeypatch.setattr("tungsten_dip.cli.denoising.denoise", mean_color)
+    return calls
+
+
+@pytest.fixture
+def renders(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Replaces Mitsuba by the synthetic render; lists what it was asked for."""
+    calls = []
+
+    def render(scene, *, spp, seed, threads, timeout_s, progress, quantities):
+        calls.append({"spp": spp, "seed": seed, "timeout_s": timeout_s, "quantities": quantities})
+        width, height = scene.camera.resolution
+        buffers = synthetic_render(height, width, seed=seed).buffers
+        unwanted = {"albedo", "normal", "depth"}.difference(quantities)
+        return buffers.with_quantities(**dict.fromkeys(unwanted))
+
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", render)
+    monkeypatch.setattr("tungsten_dip.hosts.tungsten.available", lambda: False)
+    return calls
 
 
 def relmse(image: FloatImage, reference: FloatImage) -> float:

@@ -74,12 +74,6 @@ def test_every_way_stays_finite(way: str, case: HardCase, undamaged: FitResult) 
 
 
 @pytest.mark.parametrize("exponent", [-21, 13])
-def test_exposure_is_undone(exponent: int, undamaged: FitResult) -> None:
-    result = denoise(exposed(healthy().buffers, exponent), DRAFT)
-    np.testing.assert_array_equal(result.color, undamaged.color * np.float32(2.0**exponent))
-
-
-@pytest.mark.parametrize("exponent", [-21, 13])
 def test_halves_are_tested_alike_at_any_exposure(exponent: int) -> None:
     (case,) = (case for case in CASES if case.name == "halves correlated, +0.5")
     buffers = case.make().buffers
@@ -153,7 +147,7 @@ def test_gradients_of_the_published_loss(network: str) -> None:
         _check_gradient(parameter, parameter.grad, loss, entries=2)
 
 
-def _check_gradient(parameter, gradient, loss: Callable[[], float], entries: int = 8) -> None:
+def _check_gradient(parameter, gradient, loss: Callable[[], float], entries: int) -> None:
     """Compare the largest entries and some others with central differences."""
     step = 1e-6
     values, flat = parameter.data, gradient.reshape(-1)

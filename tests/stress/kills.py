@@ -14,7 +14,7 @@ from pathlib import Path
 
 import OpenImageIO
 
-from conftest import SCENE
+from commands import SCENE
 from moving_camera import write_frames
 from row import Row
 from tungsten_dip.buffers.image_file import read_parts
