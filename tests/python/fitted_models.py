@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from tungsten_dip.buffers import RenderBuffers
-from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.model import Model
@@ -33,3 +35,17 @@ def session_of(model: Model) -> Any:
 def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
     """Return what a fit of preset draft knows of the buffers, with other pilots."""
     return evidence_from_buffers(HalvedImage(buffers), DRAFT, pilots, Clock(), silent, None, None)
+
+
+def check_result(result: FitResult, buffers: RenderBuffers) -> None:
+    """Assert what holds of every result."""
+    assert result.color.shape == buffers.color.mean.shape
+    assert result.color.dtype == np.float32
+    assert np.isfinite(result.color).all()
+    assert result.color.min(initial=0) >= 0
+    assert (result.error is None) == (result.estimated_relmse is None)
+    if result.error is not None and result.estimated_relmse is not None:
+        assert result.error.shape == (*buffers.color.mean.shape[:2], 1)
+        assert np.isfinite(result.error).all()
+        assert result.error.min() >= 0
+        assert np.isfinite(result.estimated_relmse)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender, SyntheticRender, relmse
+from fitted_models import check_result
 from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, write_denoised
-from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, FitSettings, denoise, fusion, training
+from tungsten_dip.fit import FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
@@ -36,20 +36,6 @@ def _settings(**changes: Any) -> FitSettings:
     return FitSettings(**{"preset": "draft", "iterations": 30, "threads": 1, "device": "cpu", **changes})
 
 
-def _check(result: FitResult, buffers: RenderBuffers) -> None:
-    """What holds of every result."""
-    assert result.color.shape == buffers.color.mean.shape
-    assert result.color.dtype == np.float32
-    assert np.isfinite(result.color).all()
-    assert result.color.min(initial=0) >= 0
-    assert (result.error is None) == (result.estimated_relmse is None)
-    if result.error is not None and result.estimated_relmse is not None:
-        assert result.error.shape == (*buffers.color.mean.shape[:2], 1)
-        assert np.isfinite(result.error).all()
-        assert result.error.min() >= 0
-        assert np.isfinite(result.estimated_relmse)
-
-
 def _halved(color: FloatImage, relative_noise: float, seed: int = 0) -> Buffer:
     """Independent halves of a noise-free colour."""
     rng = np.random.default_rng(seed)
@@ -66,7 +52,7 @@ def _halved(color: FloatImage, relative_noise: float, seed: int = 0) -> Buffer:
 def test_error_falls_and_is_estimated(preset: str, spp: int, factor: float, make_render: MakeRender) -> None:
     render = make_render(spp=spp)
     result = denoise(render.buffers, _settings(preset=preset, iterations=60))
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     error = relmse(result.color, render.reference)
     assert error < relmse(render.buffers.color.mean, render.reference) / factor
     assert result.estimated_relmse is not None
@@ -136,7 +122,7 @@ def test_any_size(size: tuple[int, int], halves: bool, make_render: MakeRender) 
     if not halves:
         buffers = buffers.with_quantities(color=Buffer(buffers.color.mean))
     result = denoise(buffers, _settings(iterations=3))
-    _check(result, buffers)
+    check_result(result, buffers)
 
 
 def test_an_empty_image_is_refused(make_render: MakeRender) -> None:
@@ -148,13 +134,13 @@ def test_an_empty_image_is_refused(make_render: MakeRender) -> None:
 def test_color_alone(render: SyntheticRender) -> None:
     buffers = RenderBuffers(render.buffers.color)
     result = denoise(buffers, _settings())
-    _check(result, buffers)
+    check_result(result, buffers)
     assert any("no albedo, normal, depth" in note for note in result.notes)
     noisy = relmse(buffers.color.mean, render.reference)
     assert relmse(result.color, render.reference) < noisy / 1.4
     without_halves = RenderBuffers(Buffer(buffers.color.mean))
     result = denoise(without_halves, _settings())
-    _check(result, without_halves)
+    check_result(result, without_halves)
     assert relmse(result.color, render.reference) < 1.2 * noisy  # every edge passes for noise
 
 
@@ -162,7 +148,7 @@ def test_color_alone(render: SyntheticRender) -> None:
 def test_a_missing_feature_is_noted(missing: str, render: SyntheticRender) -> None:
     buffers = render.buffers.with_quantities(**{missing: None})
     result = denoise(buffers, _settings(iterations=5))
-    _check(result, buffers)
+    check_result(result, buffers)
     assert any(note.startswith(f"no {missing}:") for note in result.notes)
     assert not any(note.startswith("no ") for note in denoise(render.buffers, _settings(iterations=1)).notes)
 
@@ -171,7 +157,7 @@ def test_without_halves_the_noise_is_split(render: SyntheticRender) -> None:
     color = render.buffers.color
     buffers = render.buffers.with_quantities(color=Buffer(color.mean))
     result = denoise(buffers, _settings())
-    _check(result, buffers)
+    check_result(result, buffers)
     assert result.model is not None
     assert any("no half buffers: its noise" in note for note in result.notes)
     error = relmse(result.color, render.reference)
@@ -197,7 +183,7 @@ def test_copied_halves_are_replaced(render: SyntheticRender) -> None:
         color=Buffer(mean, mean, mean.copy(), render.buffers.color.variance)
     )
     result = denoise(buffers, _settings())
-    _check(result, buffers)
+    check_result(result, buffers)
     assert any("not independent" in note for note in result.notes)
     assert relmse(result.color, render.reference) < relmse(mean, render.reference) / 8
 
@@ -216,7 +202,7 @@ def test_what_no_renderer_can_mean_stays_out(value: float, halves: bool, make_re
             array[rng.integers(20, size=3), rng.integers(24, size=3)] = value
         broken[name] = Buffer(**planes)
     result = denoise(buffers.with_quantities(**broken), _settings(iterations=5))
-    _check(result, buffers)
+    check_result(result, buffers)
 
 
 @pytest.mark.parametrize("value", [1e12, 1e30, 3e38])
@@ -226,7 +212,7 @@ def test_a_wild_albedo_is_not_smeared(value: float, render: SyntheticRender) -> 
     for name in ("mean", "half_a"):
         planes[name][30, 40] = value
     result = denoise(render.buffers.with_quantities(albedo=Buffer(**planes)), _settings())
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     noisy = relmse(render.buffers.color.mean, render.reference)
     assert relmse(result.color, render.reference) < noisy / 4
 
@@ -239,7 +225,7 @@ def test_a_firefly_leaves_no_blot(render: SyntheticRender) -> None:
     half_a[8, 9] = 1e7
     buffers = render.buffers.with_quantities(color=Buffer((half_a + color.half_b) / 2, half_a, color.half_b))
     result = denoise(buffers, _settings())
-    _check(result, buffers)
+    check_result(result, buffers)
     assert any("1 firefly limited" in note for note in result.notes)
     assert relmse(result.color, render.reference) < relmse(color.mean, render.reference) / 4
 
@@ -249,7 +235,7 @@ def test_black_stays_black(render: SyntheticRender) -> None:
     for color in (Buffer(black, black, black, black), Buffer(black)):
         buffers = RenderBuffers(color)
         result = denoise(buffers, _settings(iterations=3))
-        _check(result, buffers)
+        check_result(result, buffers)
         np.testing.assert_array_equal(result.color, black)
 
 
@@ -259,7 +245,7 @@ def test_a_converged_image_is_left_nearly_alone(relative_noise: float, render: S
     color = render.reference * (1 + 0.5 * np.sin(np.arange(56) * 0.9))[None, :, None]
     buffers = render.buffers.with_quantities(color=_halved(color.astype(np.float32), relative_noise))
     result = denoise(buffers, _settings())
-    _check(result, buffers)
+    check_result(result, buffers)
     np.testing.assert_allclose(result.color, buffers.color.mean, rtol=1e-3)
 
 
@@ -274,7 +260,7 @@ def test_a_good_candidate_is_chosen(render: SyntheticRender) -> None:
     alone = denoise(render.buffers, _settings())
     truth = render.reference
     together = denoise(render.buffers, _settings(), candidates=[(truth, truth)])
-    _check(together, render.buffers)
+    check_result(together, render.buffers)
     assert relmse(together.color, truth) < relmse(alone.color, truth) / 2
 
 
@@ -282,7 +268,7 @@ def test_a_bad_candidate_does_little_harm(render: SyntheticRender) -> None:
     alone = denoise(render.buffers, _settings(iterations=80))
     wrong = np.full_like(render.reference, -1.0)
     together = denoise(render.buffers, _settings(iterations=80), candidates=[(wrong, 10 * render.reference)])
-    _check(together, render.buffers)
+    check_result(together, render.buffers)
     assert relmse(together.color, render.reference) < 1.3 * relmse(alone.color, render.reference)
 
 
@@ -312,14 +298,14 @@ def test_candidates_that_cannot_be_used_are_refused(
 
 def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:
     result = denoise(render.buffers, _settings(iterations=100_000, time_budget_s=1e-6))
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert result.iterations == 1
     assert any("time budget" in note for note in result.notes)
 
 
 def test_within_a_time_budget_the_pilots_of_draft_come_first(render: SyntheticRender) -> None:
     result = denoise(render.buffers, _settings(preset="balanced", iterations=2, time_budget_s=1e6))
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert result.model is not None
     assert result.model.layout is not None
     pilots = result.model.layout.pilots
@@ -337,7 +323,7 @@ def test_windows_as_large_as_the_image_are_left_out(make_render: MakeRender) -> 
 
 def test_the_target_error_ends_the_training(render: SyntheticRender) -> None:
     result = denoise(render.buffers, _settings(iterations=100_000, target_error=0.5))
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert result.iterations < 100
     assert any("target error" in note for note in result.notes)
     assert result.history[-1].estimated_relmse is not None
@@ -354,7 +340,7 @@ def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRe
 
     result = denoise(render.buffers, _settings(iterations=100_000), interrupt)
     assert len(raised) == 1
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert result.interrupted
     assert any(note.startswith(f"interrupted at step {result.iterations}") for note in result.notes)
     assert 1 <= result.iterations < 1000
@@ -386,7 +372,7 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
 
     monkeypatch.setattr(fusion, "pilots_of_all_samples", until_given_up)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2, iterations=100_000), interrupt)
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert told == [True]
     assert result.interrupted
 
@@ -437,7 +423,7 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
     monkeypatch.setattr(fusion, "wait", wait_or_interrupt)
     monkeypatch.setattr(fusion, "pilots_of_all_samples", after_training)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2))
-    _check(result, render.buffers)
+    check_result(result, render.buffers)
     assert told == [True, True]
     assert result.interrupted
     assert result.iterations == 30
@@ -506,11 +492,11 @@ def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) 
         assert surfaces.features.shape == (40, 56, 2)
         assert len(surfaces.penalty) == 2
         assert (np.ptp(surfaces.features, axis=(0, 1)) > 0).all()
-    _check(denoise(buffers, _settings(iterations=2)), buffers)
+    check_result(denoise(buffers, _settings(iterations=2)), buffers)
     channels = {"albedo": [0, 1, 2], "normal": [0, 1, 2], "depth": [0]}
     nothing = render.buffers.with_quantities(**{name: flattened(name, of) for name, of in channels.items()})
     assert [surfaces.features.shape for surfaces in _surfaces(nothing)] == [(40, 56, 0)] * 2
-    _check(denoise(nothing, _settings(iterations=2)), nothing)
+    check_result(denoise(nothing, _settings(iterations=2)), nothing)
 
 
 def test_surfaces_of_a_half_take_nothing_but_weights_from_the_other(render: SyntheticRender) -> None:
@@ -710,49 +696,6 @@ def test_batches_show_all_that_is_trained_on_and_nothing_else(
     assert seen == {*trained, *(pixels + trained)}
 
 
-@pytest.mark.parametrize("spoil", ["sums", "another picture", "little of another layer"])
-@pytest.mark.parametrize("black", [0.0, 0.8])
-def test_halves_of_another_picture_are_left_aside(spoil: str, black: float, render: SyntheticRender) -> None:
-    color = render.buffers.color
-    assert color.half_a is not None
-    assert color.half_b is not None
-    mean, a, b = color.mean.copy(), color.half_a.copy(), color.half_b.copy()
-    for image in (mean, a, b):
-        image[: round(black * len(image))] = 0
-    if spoil == "sums":
-        a, b = a / 2, b / 2
-    elif spoil == "another picture":
-        a, b = (np.ascontiguousarray(half[:, ::-1]) for half in (a, b))
-    else:
-        mean[:, : mean.shape[1] // 8] = 0
-    buffers = render.buffers.with_quantities(color=Buffer(mean, a, b, color.variance))
-    result = denoise(buffers, _settings())
-    _check(result, buffers)
-    assert any("color: the half buffers are not used" in note for note in result.notes)
-    assert result.color.mean() == pytest.approx(mean.mean(), rel=0.05)
-
-
-def test_halves_of_another_picture_are_found_wherever_they_show() -> None:
-    """In a picture of many pixels, of which only some are looked at: not a single column, say."""
-    a, b, mean = (np.zeros((1 << 14, 8, 3), np.float32) for _ in range(3))
-    mean[:, 5:] = 1
-    _, lines = without_foreign_halves(RenderBuffers(Buffer(mean, a, b)))
-    assert len(lines) == 1
-    assert without_foreign_halves(RenderBuffers(Buffer(mean, mean, mean)))[1] == ()
-
-
-def test_halves_of_another_feature_are_left_aside(render: SyntheticRender) -> None:
-    normal = render.buffers.normal
-    assert normal is not None
-    assert normal.halves is not None
-    flipped = (np.ascontiguousarray(half[:, ::-1]) for half in normal.halves)
-    mixed = render.buffers.with_quantities(normal=Buffer(normal.mean, *flipped, normal.variance))
-    alone = render.buffers.with_quantities(normal=Buffer(normal.mean, variance=normal.variance))
-    result = denoise(mixed, _settings())
-    assert any("normal: the half buffers are not used" in note for note in result.notes)
-    np.testing.assert_array_equal(result.color, denoise(alone, _settings()).color)
-
-
 @pytest.mark.parametrize("preset", ["draft", "paper"])
 def test_no_light_where_nothing_is_covered(
     preset: Literal["draft", "paper"], render: SyntheticRender
@@ -770,15 +713,6 @@ def test_no_light_where_nothing_is_covered(
     result = denoise(buffers, settings).color
     assert (result[~(covered | glow)] == 0).all()
     assert (result[glow] > 0).all()
-
-
-def test_halves_of_unequal_size_are_used(render: SyntheticRender) -> None:
-    color = render.buffers.color
-    assert color.half_a is not None
-    assert color.half_b is not None
-    mean = (2 * color.half_a + color.half_b) / 3
-    buffers = render.buffers.with_quantities(color=Buffer(mean, color.half_a, color.half_b))
-    assert not denoise(buffers, _settings()).halves_drawn
 
 
 def test_a_colour_without_a_sane_pixel_is_told(
