@@ -220,7 +220,7 @@ class WindowMeans {
 
     // Changes the rows.
     void sum_up() {
-        const auto length = static_cast<std::size_t>(2 * radius_ + 1);
+        const std::size_t length = 2 * static_cast<std::size_t>(radius_) + 1;
         std::size_t summed = 0;
         for (std::size_t rows = 1;; rows *= 2) {
             if ((length & rows) != 0) {
