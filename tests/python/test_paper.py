@@ -1,5 +1,8 @@
 """The published method: what goes in, the schedule, determinism, how it ends."""
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
@@ -289,3 +292,40 @@ def test_bfloat16_moves_the_network_by_less_than_its_input_noise():
         with torch.autocast("cpu", torch.bfloat16):
             rounded = fit.network(x).float()
     assert 0 < (rounded - exact).std() < 0.5 * (noisy - exact).std()
+
+
+@contextmanager
+def default(set_default, value, before):
+    set_default(value)
+    try:
+        yield
+    finally:
+        set_default(before)
+
+
+@pytest.mark.parametrize(
+    "context",
+    [
+        torch.no_grad,
+        torch.inference_mode,
+        lambda: torch.device("meta"),
+        lambda: default(torch.set_default_dtype, torch.float64, torch.float32),
+        lambda: default(torch.set_default_device, "meta", None),
+    ],
+    ids=["no_grad", "inference_mode", "device", "default dtype", "default device"],
+)
+@pytest.mark.parametrize("network", ["skip", "resnet"])
+def test_the_callers_settings_of_torch_change_nothing(context, network):
+    buffers, chosen = smooth_buffers(), settings(iterations=3, network=network)
+    expected = fitted(buffers, chosen).color
+    with context():
+        color = fitted(buffers, chosen).color
+    np.testing.assert_array_equal(color, expected)
+
+
+def test_fits_in_several_threads_give_the_image_of_one():
+    buffers, chosen = smooth_buffers(), settings(iterations=1)
+    expected = fitted(buffers, chosen).color
+    with ThreadPoolExecutor(4) as pool:
+        for result in pool.map(lambda _: fitted(buffers, chosen), range(24)):
+            np.testing.assert_array_equal(result.color, expected)

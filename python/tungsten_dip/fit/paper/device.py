@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,6 +11,8 @@ import torch
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
+
+_MAKING_LAYERS = threading.Lock()
 
 
 def check_torch_device(device: str) -> None:
@@ -22,6 +25,8 @@ def check_torch_device(device: str) -> None:
 def compute_device(settings: FitSettings) -> Iterator[torch.device]:
     """Yield the device of the settings; meanwhile, torch uses their number of threads.
 
+    Gradients are on and tensors are made on the CPU unless they say where, whatever the caller's contexts.
+
     Raises InputError if torch cannot compute on the device.
     """
     check_torch_device(settings.device)
@@ -29,9 +34,26 @@ def compute_device(settings: FitSettings) -> Iterator[torch.device]:
     threads_before = torch.get_num_threads()
     torch.set_num_threads(thread_count(settings.threads))
     try:
-        yield torch.device("cuda" if use_cuda else "cpu")
+        with torch.inference_mode(False), torch.enable_grad(), torch.device("cpu"):
+            yield torch.device("cuda" if use_cuda else "cpu")
     finally:
         torch.set_num_threads(threads_before)
+
+
+@contextmanager
+def seeded_layers(seed: int) -> Iterator[None]:
+    """Let layers that are made meanwhile have float32 weights drawn with this seed.
+
+    Both are global in torch: one thread at a time, and afterwards they are as before.
+    """
+    with _MAKING_LAYERS, torch.random.fork_rng(devices=[]):
+        dtype = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float32)
+        torch.default_generator.manual_seed(seed)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(dtype)
 
 
 def convolution_dtype(device: torch.device) -> torch.dtype:

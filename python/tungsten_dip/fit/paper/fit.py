@@ -19,7 +19,7 @@ from tungsten_dip.buffers.model import FloatImage, RenderBuffers
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.model import Model, Weights, check_finite, check_inputs, source_sha256
 from tungsten_dip.fit.paper.constants import ITERATIONS
-from tungsten_dip.fit.paper.device import compute_device, convolution_dtype
+from tungsten_dip.fit.paper.device import compute_device, convolution_dtype, seeded_layers
 from tungsten_dip.fit.paper.images import PaperImages, network_input, paper_images
 from tungsten_dip.fit.paper.networks import ResNet, Skip
 from tungsten_dip.fit.result import FitResult, HistoryPoint
@@ -70,13 +70,12 @@ class PaperFit:
         # is a window of this pool at a place drawn anew, so that a pixel gets the same value twice only by
         # chance.
         pool_size = fixed.numel() + _NOISE_WINDOWS * _NOISE_STRIDE
-        self._noise_pool = torch.randn(pool_size, generator=generator).to(device, dtype)
+        self._noise_pool = torch.randn(pool_size, generator=generator, dtype=torch.float32).to(device, dtype)
         self._generator = generator
 
         self._wanted = _nchw(torch.from_numpy(images.wanted).to(device))
         self._average: Tensor | None = None
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(settings.seed)
+        with seeded_layers(settings.seed):
             outputs = images.wanted.shape[2]
             self.network: nn.Module = (
                 Skip(channels, outputs, settings.channels)
@@ -226,7 +225,9 @@ def _as_one_vector(network: nn.Module) -> Tensor:
     keep their channels last in memory.
     """
     weights = list(network.parameters())
-    vector = torch.empty(sum(weight.numel() for weight in weights), device=weights[0].device)
+    vector = torch.empty(
+        sum(weight.numel() for weight in weights), device=weights[0].device, dtype=weights[0].dtype
+    )
     vector.grad = torch.zeros_like(vector)
     first = 0
     for weight in weights:
