@@ -772,6 +772,44 @@ def test_radiance_pictures_without_a_unit_are_refused(tmp_path: Path, line: str)
     refused(tmp_path / "a.hdr", f"expected one number after EXPOSURE=, three after .*, got '{line}'; save it")
 
 
+@pytest.mark.parametrize(
+    "header", ["PF\n4 2\n-1\n", "PF 4 2 -1.000000\n", "PF\n# made by hand\n4\n2\n-1e0\n"]
+)
+def test_pfm_headers_of_every_layout_are_read(tmp_path: Path, header: str) -> None:
+    (tmp_path / "a.pfm").write_bytes(header.encode() + np.arange(24, dtype="<f4").tobytes())
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "a.pfm"), np.arange(24, dtype=np.float32).reshape(2, 4, 3)[::-1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("header", "more", "message"),
+    [
+        ("PF\r\n4 2\r\n-1\r\n", 0, "lines that end in LF, got CR LF"),
+        ("PF\n4 2\n-1\r\n", 0, "lines that end in LF, got CR LF"),
+        ("PF4\n4 2\n-1\n", 8, "damaged"),
+        ("PF\n4 2\n0\n", 0, "a scale such as -1, .* got '0'"),
+        ("PF\n4 2\nnan\n", 0, "a scale such as -1, .* got 'nan'"),
+        ("PF\n4 2\n-inf\n", 0, "a scale such as -1, .* got '-inf'"),
+        ("PF\n4 2\n-1\n", 1, "expected 106 bytes, got 110"),
+        ("PF\n4 2\n-1\n", -1, "expected 106 bytes, got 102"),
+        ("Pf\n4 2\n-1\n", 0, "expected 42 bytes, got 106"),
+    ],
+)
+def test_pfm_files_that_would_read_as_another_picture_are_refused(
+    tmp_path: Path, header: str, more: int, message: str
+) -> None:
+    (tmp_path / "a.pfm").write_bytes(header.encode() + bytes(4 * (4 * 2 * 3 + more)))
+    refused(tmp_path / "a.pfm", message)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
+def test_a_file_of_another_format_than_its_name_says_is_refused(tmp_path: Path, suffix: str) -> None:
+    save(tmp_path / "a.exr", *"RGB")
+    (tmp_path / "a.exr").rename(tmp_path / f"a{suffix}")
+    refused(tmp_path / f"a{suffix}", f"expected {suffix} data, got openexr; rename it")
+
+
 @pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
 def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> None:
     write_image(tmp_path / "a.png", np.ones((3, 4, 3), np.float32))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,6 +39,14 @@ _MOST_BYTES = 16 << 30
 
 _RADIANCE_SCALES = {b"EXPOSURE": 1, b"COLORCORR": 3}
 """Lines of a .hdr header that say what the pixels have been multiplied by, and how many numbers each has."""
+
+_FORMATS = {".exr": "openexr", ".pfm": "pnm", ".hdr": "hdr"}
+"""OpenImageIO's names of the formats."""
+
+_PFM_HEADER = re.compile(rb"(P[Ff])@(\d+)@(\d+)@(\S+)\s".replace(b"@", rb"(?:\s|#[^\n]*\n)+"))
+"""Kind, width, height, scale, between them white space and comments."""
+
+_LONGEST_PFM_HEADER = 1 << 12
 
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
@@ -267,6 +276,13 @@ def _part(path: Path, image: Any, index: int) -> Part:
     formats = [spec.channelformat(channel) for channel in range(spec.nchannels)]
     if path.suffix.lower() in RADIANCE_SUFFIXES and not {"uint8", "uint16"}.isdisjoint(map(str, formats)):
         raise InputError(f"{path}: holds no linear radiance but a picture of few bits; save it as .exr")
+    suffix = path.suffix.lower()
+    if image.format_name() != _FORMATS.get(suffix, image.format_name()):
+        raise InputError(
+            f"{path}: expected {suffix} data, got {image.format_name()}; rename it as what it is"
+        )
+    if suffix == ".pfm":
+        _check_pfm(path)
     channels: dict[str, Channel] = {}
     begin = 0
     while begin < spec.nchannels:
@@ -283,6 +299,36 @@ def _part(path: Path, image: Any, index: int) -> Part:
         channels.update(zip(spec.channelnames[begin:end], planes, strict=True))
         begin = end
     return Part(channels, name=spec.getattribute("oiio:subimagename") or "")
+
+
+def _check_pfm(path: Path) -> None:
+    """Check what OpenImageIO takes as it comes: the header, and that the pixels are all that follows it.
+
+    The pixels are multiplied by the scale without its sign, which stands for the order of their bytes.
+    """
+    with path.open("rb") as file:
+        begin = file.read(_LONGEST_PFM_HEADER)
+    header = _PFM_HEADER.match(begin)
+    if header is None:
+        raise InputError(f"{path}: is damaged (expected PF or Pf, a size and a scale); render it again")
+    if b"\r" in header[0]:
+        raise InputError(f"{path}: expected lines that end in LF, got CR LF; write or copy it in binary mode")
+    kind, width, height, scale = header.groups()
+    try:
+        readable = np.finfo(np.float32).tiny < abs(float(scale)) < np.finfo(np.float32).max
+    except ValueError:
+        readable = False
+    if not readable:
+        raise InputError(
+            f"{path}: expected a scale such as -1, finite and not 0, got {scale.decode('latin-1')!r:.40}; "
+            f"correct it, or save as .exr"
+        )
+    expected = header.end() + int(width) * int(height) * 4 * (3 if kind == b"PF" else 1)
+    if (length := path.stat().st_size) != expected:
+        raise InputError(
+            f"{path}: is damaged or truncated (expected {expected} bytes, got {length}); render or copy it "
+            f"again"
+        )
 
 
 def _radiance_scale(path: Path) -> FloatArray:
