@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from tungsten_dip import hosts
 from tungsten_dip.buffers import read_image, write_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import FitSettings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.hosts import memory, native, tungsten
 from tungsten_dip.scene.parse import load_scene
@@ -373,6 +375,27 @@ def test_the_command_denoises_and_previews_beside_the_renders_own_files(write_sc
 
 
 @in_process
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_exr_files_are_written_whether_or_not_tungsten_can(write_scene, tmp_path, monkeypatch, interrupted):
+    def drive(*arguments):
+        return replace(original(*arguments), interrupted=interrupted)
+
+    original = tungsten.drive
+    monkeypatch.setattr(tungsten, "drive", drive)
+    fit = FitResult(np.zeros((24, 40, 3), np.float32), FitSettings(), seconds=0.0, iterations=0)
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.denoise_with_progress", lambda *_: fit)
+    own = [
+        {"type": "albedo", "hdr_output_file": "own.exr", "two_buffer_variance": True},
+        {"type": "normal", "hdr_output_file": "normal.pfm"},
+    ]
+    scene = write_scene(hdr_output_file="picture.exr", output_buffers=own)
+    arguments = ["--host", "tungsten", "--dip-denoise", "-d", str(tmp_path / "out"), str(scene)]
+    assert main(arguments) == (130 if interrupted else 0)
+    for name in ("picture.exr", "own.exr", "ownA.exr", "ownB.exr", "normal.pfm"):
+        assert read_image(tmp_path / "out" / name).any(), name
+
+
+@in_process
 def test_tungsten_writes_its_pictures_under_the_names_of_the_denoised_ones(
     write_scene, tmp_path, monkeypatch
 ):
@@ -406,9 +429,11 @@ def test_interrupting_saves_the_outputs_of_the_passes_so_far(write_scene, tmp_pa
     thread = threading.Thread(target=interrupt)
     thread.start()
     handler = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        tungsten.drive(path, options, progress=lambda fraction, _: started.set() if fraction > 0 else None)
+    rendered = tungsten.drive(
+        path, options, progress=lambda fraction, _: started.set() if fraction > 0 else None
+    )
     thread.join()
+    assert rendered.interrupted
     assert signal.getsignal(signal.SIGINT) is handler
     assert read_image(tmp_path / "out" / "picture.pfm").mean() > 0
 

@@ -6,6 +6,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -281,20 +282,36 @@ def _render_with_tungsten(
     settings: FitSettings,
     progress: Progress,
 ) -> tuple[RenderBuffers, SceneOutputs]:
-    """Render a scene; return its buffers, and what Tungsten has not written of its outputs."""
+    """Render a scene; return its buffers, and what Tungsten has not written of its outputs.
+
+    Raises KeyboardInterrupt if Ctrl-C ended the render, with all outputs written.
+    """
     preview = _preview(outputs, settings) if options.dip_preview else None
-    before = _last_written(outputs.hdr)
+    before = {path: _last_written(path) for path, _ in outputs.files()}
     rendered = tungsten_host.drive(scene.path, _driver_options(options, scene, outputs), preview, progress)
-    return rendered.buffers, SceneOutputs(
+
+    # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
+    def is_unwritten(path: Path) -> bool:
+        return _last_written(path) == before[path]
+
+    unwritten = SceneOutputs(
         ldr=None if rendered.output_file else outputs.ldr,
-        # A Tungsten that was built without OpenEXR writes no .exr, and says nothing of it.
-        hdr=None if _last_written(outputs.hdr) != before else outputs.hdr,
+        hdr=outputs.hdr if outputs.hdr and is_unwritten(outputs.hdr) else None,
+        buffers=tuple(
+            replace(buffer, ldr_output_file="")
+            for buffer in outputs.buffers
+            if buffer.hdr_output_file and is_unwritten(Path(buffer.hdr_output_file))
+        ),
     )
+    if rendered.interrupted:
+        write_render(rendered.buffers, unwritten, rendered.tonemap)
+        raise KeyboardInterrupt
+    return rendered.buffers, unwritten
 
 
-def _last_written(path: Path | None) -> int | None:
+def _last_written(path: Path) -> int | None:
     """Return the time of a file's last change in nanoseconds, None where there is no file."""
-    return path.stat().st_mtime_ns if path is not None and path.exists() else None
+    return path.stat().st_mtime_ns if path.exists() else None
 
 
 def _each_alone(settings: FitSettings, warm_start: Model | None) -> Denoise:

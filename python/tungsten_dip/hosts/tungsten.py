@@ -62,12 +62,13 @@ class DriverOptions:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A render, finished or at a checkpoint, and the files (absolute) that Tungsten writes of it."""
+    """A render, finished, ended by Ctrl-C or at a checkpoint, and the files (absolute) it has in Tungsten."""
 
     buffers: RenderBuffers
     output_file: Path | None
     hdr_output_file: Path | None
     tonemap: TonemapName
+    interrupted: bool = False
 
 
 def available() -> bool:
@@ -121,8 +122,8 @@ def drive(
     in it. ``on_checkpoint`` is given a copy of what is known at each checkpoint; if it fails, the render
     goes on without it and the error is raised at the end.
 
-    Whatever happens, the render's own files are written before this returns or raises. The first Ctrl-C
-    ends the render after the pass in hand (KeyboardInterrupt), a second one ends the process.
+    Whatever happens, the files that Tungsten can write are written before this returns or raises. The first
+    Ctrl-C ends the render after the pass in hand (``interrupted``), a second one ends the process.
 
     Raises InputError if Tungsten cannot load or render the scene, or is not there.
     """
@@ -130,10 +131,10 @@ def drive(
     session = _load(Path(scene_path), options)
     plan = session.plan
 
-    def rendered(arrays: _Arrays) -> Rendered:
+    def rendered(arrays: _Arrays, interrupted: bool = False) -> Rendered:
         output_file = Path(plan.output_file) if plan.output_file else None
         hdr_output_file = Path(plan.hdr_output_file) if plan.hdr_output_file else None
-        return Rendered(_buffers(plan, arrays), output_file, hdr_output_file, plan.tonemap)
+        return Rendered(_buffers(plan, arrays), output_file, hdr_output_file, plan.tonemap, interrupted)
 
     failure: Exception | None = None
 
@@ -152,11 +153,9 @@ def drive(
     finally:
         if session.current_spp > 0:
             session.save_outputs()
-    if interrupted:
-        raise KeyboardInterrupt
-    if failure is not None:
+    if failure is not None and not interrupted:
         raise failure
-    return rendered(session.take_buffers())
+    return rendered(session.take_buffers(), interrupted)
 
 
 def _load(scene: Path, options: DriverOptions) -> Any:
