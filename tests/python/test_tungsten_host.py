@@ -316,6 +316,9 @@ def test_a_saved_state_is_resumed(write_scene, tmp_path, caplog):
     state.write_bytes(state.read_bytes()[:-100])
     with pytest.raises(InputError, match="cut short; delete it"):
         tungsten.drive(path, longer)
+    state.write_bytes(np.random.default_rng(1).bytes(5000))
+    with pytest.raises(InputError, match=r"saved state cannot be read: .*; delete it"):
+        tungsten.drive(path, longer)
 
 
 @in_process

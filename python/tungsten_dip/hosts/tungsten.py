@@ -29,6 +29,9 @@ from tungsten_dip.scene.types import TonemapName
 
 _LOG = logging.getLogger(__name__)
 
+# Tungsten's messages quote files: where those are no UTF-8, its exception cannot be turned into Python's.
+_FAILED = (RuntimeError, UnicodeDecodeError)
+
 _Arrays = Mapping[str, Any]
 """What the hook hands over: {quantity: {mean, half_a, half_b, variance}, "spp": a number or an array}."""
 
@@ -176,7 +179,7 @@ def _load(scene: Path, options: DriverOptions) -> Any:
         )
     except module.PictureTooLarge as size:
         raise too_large(scene, str(size), max_pixels) from None
-    except RuntimeError as error:
+    except _FAILED as error:
         raise InputError(
             f"{scene}: Tungsten cannot load it ({error}); check the scene and the files that it names"
         ) from None
@@ -208,7 +211,7 @@ def _render_passes(
         ) as interrupt_requested:
             try:
                 session.render_pass()
-            except RuntimeError as error:
+            except _FAILED as error:
                 raise InputError(f"{scene}: Tungsten cannot render it: {error}") from None
         if interrupt_requested():
             return True
@@ -226,7 +229,7 @@ def _render_passes(
 def _resume(session: Any, scene: Path) -> None:
     try:
         resumed = session.resume()
-    except RuntimeError as error:
+    except _FAILED as error:
         message = f"{scene}: its saved state cannot be read: {error}; delete it, or render with --restart"
         raise InputError(" ".join(message.split())) from None
     if resumed:
