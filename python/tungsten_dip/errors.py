@@ -1,5 +1,6 @@
 """The one exception for what a user can fix: bad files, bad scenes, bad settings."""
 
+from collections.abc import Collection
 from numbers import Integral
 from typing import Any
 
@@ -14,11 +15,22 @@ def check_type(what: str, value: Any, expected: type, remedy: str) -> None:
         raise InputError(f"{what}: expected {expected.__name__}, got {type(value).__name__}; {remedy}")
 
 
+def check_choice(what: str, value: Any, choices: Collection[str]) -> None:
+    """Raise InputError if a value is none of these."""
+    if not (isinstance(value, str) and value in choices):
+        raise InputError(f"{what}: expected {', '.join(choices)}, got {_shown(value)}; choose one of these")
+
+
 def whole_number(what: str, value: Any, least: int, most: int) -> int:
     """Return a number, perhaps of numpy's, which neither JSON nor a renderer takes, as Python's own.
 
     Raises InputError if it is no whole number of this range.
     """
     if not (isinstance(value, Integral) and least <= int(value) <= most):
-        raise InputError(f"{what}: expected a whole number from {least} to {most}, got {value!r:.40}")
+        raise InputError(f"{what}: expected a whole number from {least} to {most}, got {_shown(value)}")
     return int(value)
+
+
+def _shown(value: Any) -> str:
+    """A value in short, in one line, which numpy's arrays are not."""
+    return f"{' '.join(repr(value).split()):.40}"

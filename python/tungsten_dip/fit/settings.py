@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.errors import InputError, check_choice, whole_number
 
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
@@ -50,13 +50,11 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(FitSettings).items():
-            if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
-                raise InputError(
-                    f"{name}: expected {', '.join(get_args(hint))}, got {getattr(self, name)!r:.40}"
-                )
+            if get_origin(hint) is Literal:
+                check_choice(name, getattr(self, name), get_args(hint))
         for name, least, most in _WHOLE_NUMBERS:
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name == "seed":
                 object.__setattr__(self, name, whole_number(name, value, least, most))
         for name in ("time_budget_s", "target_error"):
             value = getattr(self, name)
