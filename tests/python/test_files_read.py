@@ -7,6 +7,7 @@ import logging
 import string
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -597,6 +598,26 @@ def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
         refused(tmp_path / f"empty{suffix}", "no readable image")
     (tmp_path / "a.png").touch()
     refused(tmp_path / "a.png", "linear radiance")
+
+
+@pytest.mark.parametrize("read", [read_buffers, read_image])
+@pytest.mark.parametrize("suffix", ["", ".exr", ".json"])
+def test_names_too_long_to_exist_are_refused(read: Any, suffix: str) -> None:
+    with pytest.raises(InputError, match=r"cannot be read \(File name too long\); check the path"):
+        read("x" * 5000 + suffix)
+
+
+def test_a_scene_may_name_what_cannot_exist(tmp_path: Path) -> None:
+    renderer = {"hdr_output_file": "x" * 5000 + ".exr"}
+    (tmp_path / "scene.json").write_text(json.dumps({"renderer": renderer}))
+    refused(tmp_path / "scene.json", "does not exist; render the scene first")
+
+
+@pytest.mark.parametrize("mapping", [np.zeros(3), "color=A", {"color": np.zeros(2)}])
+def test_a_mapping_that_is_none_is_refused(tmp_path: Path, mapping: Any) -> None:
+    save(tmp_path / "a.exr", *"RGB")
+    with pytest.raises(InputError, match=r"mapping: expected dict|no such layer or channel"):
+        read_buffers(tmp_path / "a.exr", mapping)
 
 
 def test_every_truncation_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -287,6 +287,8 @@ def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) ->
         write_denoised(
             tmp_path / "out.exr", replace(result_for(buffers), error=result_for(other).error), buffers
         )
+    with pytest.raises(InputError, match="buffers: expected RenderBuffers, got NoneType; give those"):
+        write_denoised(tmp_path / "out.exr", result_for(buffers), None)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"ends in \.exr"):
         write_denoised(tmp_path / "out.png", result_for(buffers), buffers)
     assert not list(tmp_path.glob("out*"))
@@ -566,6 +568,13 @@ def test_negative_values_are_not_lost_in_a_format_without_sign(tmp_path: Path) -
     for suffix in (".exr", ".pfm"):
         write_image(tmp_path / f"a{suffix}", image)
         assert np.array_equal(read_image(tmp_path / f"a{suffix}"), image)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])
+def test_values_beyond_float32_are_refused(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(InputError, match=r"expected values up to 3e38 \(float32\), got larger ones; scale"):
+        write_image(tmp_path / f"a{suffix}", np.full((3, 4, 3), 1e300))
+    assert not list(tmp_path.iterdir())
 
 
 def test_pfm_is_stored_bottom_up(tmp_path: Path) -> None:

@@ -164,3 +164,10 @@ def test_dark_references_have_no_exposures_for_flip(level: float) -> None:
     reference = (level * np.random.default_rng(0).random((16, 16, 3))).astype(np.float32)
     hdrflip = compare(reference * np.float32(1.1), reference).hdrflip
     assert (hdrflip is None) == (level < 5e-7)
+
+
+def test_values_beyond_float32_are_refused(gradient):
+    large = np.full(gradient.shape, 1e300)
+    for name, pair in (("image", (large, gradient)), ("reference", (gradient, large))):
+        with pytest.raises(InputError, match=f"{name}: expected values up to 3e38"):
+            compare(*pair)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import is_utf8, replacing
-from tungsten_dip.buffers.model import FloatArray, Quantity, check_array
+from tungsten_dip.buffers.model import FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -80,7 +81,7 @@ def read_parts(path: Path) -> tuple[Part, ...]:
 
     Raises InputError if the file is missing, no such image, deep, truncated or larger than MAX_PIXELS.
     """
-    if path.is_dir():
+    if is_folder(path):
         raise InputError(f"{path}: expected an image, this is a folder; name a file in it")
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name")
@@ -94,6 +95,14 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: not enough memory to read it ({error}); free some, or crop it") from error
     except (RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether this is a folder. Raises InputError if that cannot be known, as of too long a name."""
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
@@ -180,8 +189,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     """Write one picture of shape (height, width, 1 or 3), whole or not at all.
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
-    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if these are no numbers,
-    if a .hdr would lose negative values, or if the file cannot be written.
+    (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if these are no numbers
+    or too large ones, if a .hdr would lose negative values, or if the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -193,9 +202,10 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
             f"{path}: expected a picture of shape (height, width, 1 or 3), got {image.shape}; reshape it, or "
             f"choose channels"
         )
+    image = as_float32(str(path), image)
     if suffix == ".exr":
         names = "RGB" if image.shape[2] == 3 else "Y"
-        channels = {name: image[..., index].astype(np.float32) for index, name in enumerate(names)}
+        channels = {name: image[..., index] for index, name in enumerate(names)}
         write_exr(path, [Part(channels)])
         return
     if suffix == ".hdr":
@@ -209,7 +219,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         checked_name(temporary.parent)
         name = str(temporary)
         output = oiio.ImageOutput.create(name)
-        pixels = np.ascontiguousarray(image, dtype=np.float32)
+        pixels = np.ascontiguousarray(image)
         if output is None:
             raise OSError(_one_line(oiio.geterror()))
         written = output.open(name, spec) and output.write_image(pixels)
@@ -314,11 +324,12 @@ def _check_pfm(path: Path) -> None:
     if b"\r" in header[0]:
         raise InputError(f"{path}: expected lines that end in LF, got CR LF; write or copy it in binary mode")
     kind, width, height, scale = header.groups()
+    smallest, largest = _float32_range()
     try:
-        readable = np.finfo(np.float32).tiny < abs(float(scale)) < np.finfo(np.float32).max
+        magnitude = abs(float(scale))
     except ValueError:
-        readable = False
-    if not readable:
+        magnitude = math.nan
+    if not smallest < magnitude < largest:
         raise InputError(
             f"{path}: expected a scale such as -1, finite and not 0, got {scale.decode('latin-1')!r:.40}; "
             f"correct it, or save as .exr"
@@ -338,7 +349,7 @@ def _radiance_scale(path: Path) -> FloatArray:
     OpenImageIO leaves to the reader.
     """
     scale = [1.0, 1.0, 1.0]
-    smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+    smallest, largest = _float32_range()
     with path.open("rb") as file:
         for line in file:
             name, _, text = line.partition(b"=")
@@ -359,6 +370,10 @@ def _radiance_scale(path: Path) -> FloatArray:
                     f"the range of float32, got {line.decode('latin-1').strip()!r:.60}; save it as .exr"
                 )
     return np.array(scale, np.float32)
+
+
+def _float32_range() -> tuple[float, float]:
+    return float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def _storable(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -181,6 +181,15 @@ def check_array(what: str, array: Any, remedy: str = _AS_ARRAY) -> None:
         raise InputError(f"{what}: expected real numbers, got {array.dtype}; {remedy}")
 
 
+def as_float32(what: str, array: npt.NDArray[Any]) -> FloatImage:
+    """Return real numbers as float32. Raises InputError if some are too large for it."""
+    try:
+        with np.errstate(over="raise"):
+            return array.astype(np.float32, copy=False)
+    except FloatingPointError:
+        raise InputError(f"{what}: expected values up to 3e38 (float32), got larger ones; scale it") from None
+
+
 def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:
     if array.dtype != np.float32:
         raise InputError(f"{what}: expected float32, got {array.dtype}; use .astype(np.float32)")

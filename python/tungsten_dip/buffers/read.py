@@ -17,6 +17,7 @@ import numpy as np
 
 from tungsten_dip.buffers.image_file import (
     RADIANCE_SUFFIXES,
+    is_folder,
     radiance_suffixes,
     read_parts,
     with_known_suffix,
@@ -34,7 +35,7 @@ from tungsten_dip.buffers.layers import (
 )
 from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.json_file import object_from_json_file
 
 _LOG = logging.getLogger(__name__)
@@ -59,8 +60,10 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     Raises InputError if a file is missing, damaged or no image, if sizes differ, or if there is no colour.
     """
     path = Path(path)
-    mapping = dict(mapping or {})
-    if path.is_dir():
+    if mapping is not None:
+        check_type("mapping", mapping, dict, 'use one such as {"color": "beauty"}')
+    mapping = {str(key): str(value) for key, value in (mapping or {}).items()}
+    if is_folder(path):
         excluded = {key: value for key, value in mapping.items() if value == NOTHING}
         return _from_images(path, *_files_of_folder(path, mapping), excluded)
     if path.suffix.lower() == ".json":
@@ -104,7 +107,7 @@ def input_files(path: str | Path, mapping: Mapping[str, str] | None = None) -> l
     Raises InputError if a folder or a scene does not name them.
     """
     path = Path(path)
-    if path.is_dir():
+    if is_folder(path):
         return list(_files_of_folder(path, dict(mapping or {}))[0].values())
     if path.suffix.lower() == ".json":
         return [path, *_files_of_scene(path)[0].values()]
@@ -181,7 +184,7 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
             f'{path}: saves no colour; add {{"type": "color", "hdr_output_file": "color.exr"}} to '
             "renderer.output_buffers and render"
         )
-    if later is not None and later.exists():
+    if later is not None and _is_file(later):
         # Pictures are numbered, buffers are not: those there are of the last render.
         raise InputError(
             f"{path}: expected one picture beside its buffers, found {later.name}, too; keep that of the "
@@ -189,13 +192,20 @@ def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
         )
     for quantity in CHANNELS:
         noise = [key for suffix in _SUFFIXES[1:] if (key := quantity + suffix) in files]
-        if noise and not any(files[key].is_file() for key in noise):
+        if noise and not any(_is_file(files[key]) for key in noise):
             # A render of 1 spp has no halves. If some of these files are missing, it was cut short.
             ignored.append(f"{quantity}: no {', '.join(files.pop(key).name for key in noise)}")
-    missing = [file for file in files.values() if not file.is_file()]
+    missing = [file for file in files.values() if not _is_file(file)]
     if missing:
         raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")
     return files, ignored
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # such as too long a name
+        return False
 
 
 def _from_images(

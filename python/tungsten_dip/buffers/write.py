@@ -25,9 +25,9 @@ import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
-from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers, check_array
+from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,6 +83,7 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: expected a name that ends in .exr, which holds all layers")
+    check_type("buffers", buffers, RenderBuffers, "give those that the result was made from")
     color = _of_result("color", result.color, buffers, 3)
     source = buffers.source or _source_from_buffers(buffers)
     added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", color, float16))
@@ -197,7 +198,7 @@ def _of_result(name: str, image: FloatImage, buffers: RenderBuffers, channels: i
             f"result {name}: expected shape {expected} as the buffers have it, got {image.shape}; give the "
             f"buffers that it was made from"
         )
-    return image.astype(np.float32, copy=False)
+    return as_float32(f"result {name}", image)
 
 
 def _stored(label: str, image: FloatImage, float16: bool) -> Channel:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from tungsten_dip.buffers.model import RenderBuffers
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_choice
 from tungsten_dip.hosts import tungsten
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.progress import Progress, silent
@@ -46,8 +46,7 @@ def render(
 
     Raises InputError if the scene or the host cannot be used, or the picture would not fit into memory.
     """
-    if host not in get_args(Host):
-        raise InputError(f"host: expected one of {', '.join(get_args(Host))}, got {host}")
+    check_choice("host", host, get_args(Host))
     host = chosen_host(host)
     path, folder = (scene.path, scene.input_directory) if isinstance(scene, Scene) else (scene, None)
     _LOG.info("%s: rendered by %s", path, host.capitalize())

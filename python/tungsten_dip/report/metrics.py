@@ -10,7 +10,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_radiance
-from tungsten_dip.buffers.model import FloatImage, check_array
+from tungsten_dip.buffers.model import FloatImage, as_float32, check_array
 from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import requirement
@@ -54,7 +54,7 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
     and FLIP need the extra ``compare`` of this package, and are logged as missing without it.
 
     Raises InputError if one is no array, if the shapes differ or are not of that form, if the image is empty,
-    or if the reference is not finite.
+    if the reference is not finite, or if values are too large for float32.
     """
     for name, given in (("image", image), ("reference", reference)):
         check_array(name, given, "read_image reads one from a file")
@@ -73,8 +73,8 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
             _LOG.info("%s", requirement(package, metric))
 
     finite = np.isfinite(image)
-    x = np.where(finite, image, 0).astype(np.float32)
-    r = reference.astype(np.float32)
+    x = np.where(finite, as_float32("image", image), 0)
+    r = as_float32("reference", reference)
     displayed_x, displayed_r = ldr_from_radiance(x), ldr_from_radiance(r)
     reference_mean = float(r.mean(dtype=np.float64))
     return Comparison(
