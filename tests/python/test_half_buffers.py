@@ -43,6 +43,30 @@ def test_halves_of_another_picture_are_found_wherever_they_show() -> None:
     assert without_foreign_halves(RenderBuffers(Buffer(mean, mean, mean)))[1] == ()
 
 
+def test_halves_of_few_samples_belong_to_the_image() -> None:
+    """As Tungsten saves them of 1 to 3 samples, which go to half A and B in turn."""
+    random = np.random.default_rng(0)
+    counts = random.integers(1, 4, (16, 24, 1))
+    x, y, z = random.random((3, 16, 24, 3), np.float32)
+    a = np.where(counts == 3, (x + z) / 2, x)
+    b = np.where(counts == 1, np.float32(0), y)
+    mean = (x + np.where(counts > 1, y, 0) + np.where(counts > 2, z, 0)) / counts.astype(np.float32)
+    albedo = Buffer(mean, a, b)
+    kept, lines = without_foreign_halves(RenderBuffers(albedo, albedo))
+    assert lines == ()
+    assert kept.albedo is albedo
+    # Lights of their own, which sum up to the image.
+    for lit in (0.02, 0.3, 0.6):
+        b = np.where(random.random((16, 24, 1)) < lit, x, np.float32(0))
+        assert without_foreign_halves(RenderBuffers(Buffer(a + b, a, b)))[1]
+
+
+def test_halves_that_no_fit_uses_are_not_checked() -> None:
+    depth = np.ones((4, 6, 1), np.float32)
+    color = Buffer(np.ones((4, 6, 3), np.float32))
+    assert without_foreign_halves(RenderBuffers(color, visibility=Buffer(depth, 0 * depth, depth)))[1] == ()
+
+
 def test_halves_of_another_feature_are_left_aside(render: SyntheticRender) -> None:
     normal = render.buffers.normal
     assert normal is not None
