@@ -212,7 +212,10 @@ def test_what_frames_were_taken_for_is_told_once(frames, capsys, more):
 
 def test_bad_options_are_one_line(frames, capsys):
     for more, message in (
-        (("--workers", "0"), "--workers: expected 1 or more"),
+        (("--workers", "0"), "--workers: expected a whole number from 1 to 1024, got 0"),
+        (("--workers", "100000"), "--workers: expected a whole number from 1 to 1024, got 100000"),
+        (("--workers", "1", "--scheduler", "tcp://host:1"), "a scheduler has its own; omit one of the two"),
+        (("-o", "out/f####.png"), "ends in .exr"),
         (("--refit", "some"), "expected auto, 0 or a number"),
         (("--scheduler", "host"), "expected local or an address"),
         (("--frames", "x"), "expected numbers"),
@@ -224,6 +227,12 @@ def test_bad_options_are_one_line(frames, capsys):
         assert len(lines) == 1
         assert message in lines[0]
     assert not outputs(frames)
+
+
+def test_a_refused_run_leaves_no_folder(frames):
+    for more in (("-o", "out/f####.png"), ("--report", "page.txt"), ("--save-model", "missing/model.onnx")):
+        assert main(arguments(*more)) == 2
+    assert not (frames / "out").exists()
 
 
 def test_a_killed_run_loses_the_frame_in_hand_alone(frames):
@@ -352,6 +361,23 @@ def test_local_workers_do_what_one_does(frames, capsys):
     before = outputs(frames)
     assert main(arguments()) == 0
     assert outputs(frames) == before
+
+
+@pytest.mark.parametrize(("more", "started"), [((), 2), (("--frames", "1-2"), 1), (("--cameras", ""), 4)])
+def test_no_more_workers_start_than_have_something_to_do(frames, monkeypatch, more, started):
+    distributed = pytest.importorskip("distributed")
+
+    def local_cluster(n_workers, **_):
+        asked.append(n_workers)
+        raise RuntimeError
+
+    asked = []
+    monkeypatch.setattr(distributed, "LocalCluster", local_cluster)
+    command = arguments("--workers", "24", *more)
+    if "" in more:
+        command = [word for word in command if "camera" not in word and word]
+    assert main(command) == 2
+    assert asked == [started]
 
 
 _BLOCKED_SIGNALS = """

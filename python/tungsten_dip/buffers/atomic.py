@@ -45,19 +45,23 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
+def check_suffix(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
+    """Raise InputError if a name ends in none of these."""
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
+
+
 def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
     """Check before long work that its result can be saved as ``path``.
 
     Raises InputError if the suffix is none of ``suffixes``, or if no file can be created there.
     """
-    suffix = path.suffix.lower()
-    if suffix not in suffixes:
-        raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
+    check_suffix(path, suffixes)
     try:
         if path.is_dir():
             raise InputError(f"{path}: expected the name of a file, this is a folder")
         target = _resolved(path)
-        if suffix in _BY_OPENIMAGEIO and not is_utf8(target.parent):
+        if path.suffix.lower() in _BY_OPENIMAGEIO and not is_utf8(target.parent):
             raise InputError(f"{path}: expected a folder with a name in UTF-8 for {suffix}; choose another")
         temporary = _temporary(target)
         temporary.open("xb").close()

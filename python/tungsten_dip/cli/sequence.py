@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.buffers import check_writable, write_text
+from tungsten_dip.buffers.atomic import check_suffix
 from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.console import add_json, add_threads, progress_on_stderr
 from tungsten_dip.cli.denoising import (
@@ -23,7 +24,8 @@ from tungsten_dip.cli.denoising import (
     fit_settings,
     load_warm_start,
 )
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.fit.settings import MOST_THREADS
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
@@ -56,7 +58,7 @@ def add_sequence(commands: _SubParsersAction[Any]) -> None:
     add("--cameras", metavar="'f####.json'", help="the scenes of the frames: lets one frame help the next")
     add("--refit", metavar="auto|N|0", type=_refit, default="auto", help=_REFIT_HELP)
     add("--scheduler", metavar="local|tcp://...", default="local", help="a Dask scheduler that runs already")
-    add("--workers", metavar="N", type=int, default=1, help="how many local processes (default: 1)")
+    add("--workers", metavar="N", type=int, help="how many local processes at most (default: 1)")
     add_fit_options(sequence, prefix="")
     add_file_options(sequence)
     add("--report", metavar="R.html", type=Path, help="write a page with the frames, their time and error")
@@ -77,8 +79,9 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
         from tungsten_dip.sequence.work import Run, denoise_frames
 
-    if options.workers < 1:
-        raise InputError(f"--workers: expected 1 or more, got {options.workers}")
+    workers = 1 if options.workers is None else whole_number("--workers", options.workers, 1, MOST_THREADS)
+    if options.scheduler != "local" and options.workers is not None:
+        raise InputError("--workers: these are local processes, a scheduler has its own; omit one of the two")
     if options.scheduler != "local" and "://" not in options.scheduler:
         raise InputError(
             f"--scheduler {options.scheduler}: expected local or an address such as tcp://host:8786"
@@ -86,8 +89,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
     check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
-    frames[0].output.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(frames[0].output)
+    check_suffix(frames[0].output)
     if options.report is not None:
         check_writable(options.report, (".html",))
     if options.save_model is not None:
@@ -97,13 +99,15 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
     run = Run(settings, options.refit, dict(options.map), options.float16, digest)
     models = Models(first=warm_start)
+    frames[0].output.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(frames[0].output)
 
     with _without_repetition(), progress_on_stderr("denoising") as progress:
-        if options.scheduler == "local" and options.workers == 1:
+        if options.scheduler == "local" and workers == 1:
             records, models = denoise_frames(frames, run, models, progress, _tell)
         else:
             records, models = denoise_on_cluster(
-                frames, run, options.scheduler, options.workers, models, progress, _tell
+                frames, run, options.scheduler, workers, models, progress, _tell
             )
     if options.report is not None:
         _write_report(options.report, options.input, records)

@@ -31,6 +31,9 @@ _LOG = logging.getLogger(__name__)
 _LONGEST_TASK = 24
 """Frames; a task that is done again has to look at all of them."""
 
+_LEADS = 2
+"""Frames that others wait for, where frames follow one another."""
+
 _CONNECT_TIMEOUT_S = 30
 
 _SAFE_PATH = "PYTHONSAFEPATH"
@@ -53,7 +56,7 @@ def denoise_on_cluster(
     progress: Progress,
     tell: Callable[[Record], None],
 ) -> tuple[list[Record], Models]:
-    """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes.
+    """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes at most.
 
     Paths mean the same to all workers (a shared file system). Without ``run.settings.threads``, local workers
     share the cores, and others use one core each. Returns the records of all frames, in their order, and the
@@ -66,6 +69,7 @@ def denoise_on_cluster(
     to_do, records = split_finished(frames, run)
     for record in records:
         tell(record)
+    workers = min(workers, _tasks_at_once(to_do))
     if run.settings.threads is None:
         share = max(1, thread_count(None) // workers) if scheduler == "local" else 1
         run = replace(run, settings=replace(run.settings, threads=share))
@@ -83,6 +87,12 @@ def denoise_on_cluster(
     return sorted(records, key=lambda record: record.number), shared
 
 
+def _tasks_at_once(frames: list[Frame]) -> int:
+    """Return how many workers can have something to do at the same time, at least 1."""
+    follow = bool(frames) and frames[0].scene is not None
+    return max(1, len(frames) - (_LEADS if follow else 0))
+
+
 def _done(
     client: Any, frames: list[Frame], run: Run, models: Models
 ) -> Iterator[tuple[list[Record], Models | None, list[str]]]:
@@ -92,8 +102,8 @@ def _done(
     count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
     if frames[0].scene is not None:
         # The second frame fits the network for those that follow; all others follow one another.
-        leads = [frames[:2]]
-        length = max(1, min(_LONGEST_TASK, -(-(len(frames) - 2) // count)))
+        leads = [frames[:_LEADS]]
+        length = max(1, min(_LONGEST_TASK, -(-(len(frames) - _LEADS) // count)))
     else:
         # No frame helps another but by its network: rather than wait for one, every worker fits one.
         leads = [[frame] for frame in frames[:count]]
