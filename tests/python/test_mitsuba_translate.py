@@ -794,6 +794,30 @@ def test_a_path_tracer_stands_in_for_what_converges_to_the_same(
         assert f"a path_tracer renders in place of {kind}" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("integrator", "darker"),
+    [
+        ({"type": "bidirectional_path_tracer"}, True),
+        ({"type": "reversible_jump_mlt"}, True),
+        ({"type": "kelemen_mlt"}, True),
+        ({"type": "kelemen_mlt", "bidirectional": False}, False),
+        ({"type": "photon_map"}, False),
+    ],
+)
+def test_integrators_that_tungsten_renders_darker_are_a_warning(
+    folder: Path, caplog: pytest.LogCaptureFixture, integrator: dict[str, Any], darker: bool
+) -> None:
+    lamp = {"type": "quad", "bsdf": GREY, "emission": 1}
+    path = folder / "scene.json"
+    for primitives in ([FLOOR, WHITE_SKY], [FLOOR, WHITE_SKY, lamp]):
+        caplog.clear()
+        path.write_text(json.dumps({"primitives": primitives, "integrator": integrator}))
+        with mitsuba_variant(), caplog.at_level(logging.INFO):
+            translate(load_scene(path))
+        assert caplog.text.count(f"in place of {integrator['type']}") == 1
+        assert ("too dark" in caplog.text) == (darker and lamp in primitives)
+
+
 def test_shared_objects_are_made_once(folder: Path) -> None:
     scene = {
         "bsdfs": [{"name": "grey", **GREY}],

@@ -23,6 +23,8 @@ from tungsten_dip.scene import types as ts
 
 _LOG = logging.getLogger(__name__)
 
+_FROM_BOTH_ENDS = (ts.BidirectionalPathTracer, ts.MultiplexedMlt, ts.ReversibleJumpMlt)
+
 
 def translate(scene: ts.Scene) -> TranslatedScene:
     """Return the scene for Mitsuba's variant scalar_rgb; call it within `mitsuba_variant`.
@@ -57,6 +59,7 @@ def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
         if node is not None:
             t.add("emitter", node)
             lights += 1
+    _tell_of_replacement(t, scene.integrator, lights + len(surroundings))
     if surroundings:
         t.add("emitter", together(surroundings))
     elif not lights:
@@ -72,13 +75,34 @@ def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
     )
 
 
+def _tell_of_replacement(t: Translation, integrator: ts.Integrator, lights: int) -> None:
+    """Log that another integrator is replaced, if it is: as a warning where the picture differs.
+
+    Tungsten's paths from several lights have weights that sum to less than 1: those that hit a light ignore
+    how likely that light is chosen (`LightPath::bdptWeightedPathEmission`), and `reversible_jump_mlt` starts
+    from the first light alone.
+    """
+    if integrator.kind == ts.PathTracer.kind:
+        return
+    bidirectional = isinstance(integrator, _FROM_BOTH_ENDS) or (
+        isinstance(integrator, ts.KelemenMlt) and integrator.bidirectional
+    )
+    if bidirectional and lights > 1:
+        _LOG.warning(
+            "%s: a path_tracer renders in place of %s, which in Tungsten is too dark with several lights",
+            t.source.path,
+            integrator.kind,
+        )
+    else:
+        _LOG.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
+
+
 def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
     """Return the path tracer that converges to the picture of an integrator."""
     if isinstance(integrator, ts.PathTracer) and integrator.kind == ts.PathTracer.kind:
         return integrator
     if isinstance(integrator, ts.LightTracer):
         raise t.unsupported("a light_tracer, which shows no mirrors,")
-    _LOG.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
     kept = {}
     if isinstance(integrator, ts.PathTracer | ts.PhotonMap):
         kept = {name: getattr(integrator, name) for name in ("low_order_scattering", "include_surfaces")}
