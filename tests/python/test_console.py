@@ -54,7 +54,8 @@ def test_a_command_leaves_logging_and_stdout_as_they_were(folder, tmp_path, fits
 
 
 def test_a_reader_that_stops_early_is_no_error(scene):
-    script = f"{sys.executable} -c '{MAIN.format('tungsten_dip')}' inspect {scene} | head -c 1"
+    command = shlex.join([sys.executable, "-c", MAIN.format("tungsten_dip"), "inspect", str(scene)])
+    script = f"{command} | head -c 1"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
     assert len(done.stdout) == 1
     assert "rror" not in done.stderr
