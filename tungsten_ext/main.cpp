@@ -25,10 +25,15 @@ if (package / "errors.py").exists():
     sys.path.insert(0, str(package.parent))
 import _tungsten
 sys.modules["tungsten_dip._tungsten"] = _tungsten
-if sys.argv[1:2] == ["--dip-render-buffers"]:
-    from tungsten_dip.hosts.native import render_to_folder as main
-else:
-    from tungsten_dip.cli.tungsten import main
+try:
+    if sys.argv[1:2] == ["--dip-render-buffers"]:
+        from tungsten_dip.hosts.native import render_to_folder as main
+    else:
+        from tungsten_dip.cli.tungsten import main
+except ImportError as error:
+    print(f"tungsten: {sys.executable}: expected the Python that tungsten_dip was installed for ({error}); "
+          "name it in the environment variable TUNGSTEN_DIP_PYTHON", file=sys.stderr)
+    sys.exit(2)
 sys.argv[0] = "tungsten"
 sys.exit(main(sys.argv[1:]))
 )";

@@ -473,6 +473,19 @@ def test_the_native_command_runs_the_package_and_fails_in_one_line(tmp_path):
     assert "Traceback" not in result.stderr
 
 
+def test_the_native_command_names_what_chooses_its_python(tmp_path):
+    result = subprocess.run(
+        [native.executable(), "--dip-denoise", tmp_path / "missing.json"],
+        env={**os.environ, "TUNGSTEN_DIP_PYTHON": str(tmp_path / "python")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert "environment variable TUNGSTEN_DIP_PYTHON" in result.stderr
+
+
 def test_the_native_command_runs_no_code_beside_the_scene(tmp_path):
     for module in ("json", "logging"):
         (tmp_path / f"{module}.py").write_text("open('ran', 'w')")
