@@ -182,10 +182,10 @@ def check_array(what: str, array: Any, remedy: str = _AS_ARRAY) -> None:
 
 
 def as_float32(what: str, array: npt.NDArray[Any]) -> FloatImage:
-    """Return real numbers as float32. Raises InputError if some are too large for it."""
+    """Return real numbers as float32 in C order. Raises InputError if some are too large for it."""
     try:
         with np.errstate(over="raise"):
-            return array.astype(np.float32, copy=False)
+            return array.astype(np.float32, order="C", copy=False)
     except FloatingPointError:
         raise InputError(f"{what}: expected values up to 3e38 (float32), got larger ones; scale it") from None
 

@@ -18,7 +18,11 @@ PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 MOST_ITERATIONS = 10**9
 MOST_THREADS = 1024
 
-_WHOLE_NUMBERS = (("iterations", 1, MOST_ITERATIONS), ("seed", 0, (1 << 63) - 1), ("threads", 1, MOST_THREADS))
+_WHOLE_NUMBERS = (
+    ("iterations", 1, MOST_ITERATIONS),
+    ("seed", 0, (1 << 63) - 1),
+    ("threads", 1, MOST_THREADS),
+)
 _MOST_SCALES = 8
 _MOST_CHANNELS = 4096
 

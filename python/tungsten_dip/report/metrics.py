@@ -73,8 +73,8 @@ def compare(image: FloatImage, reference: FloatImage) -> Comparison:
             _LOG.info("%s", requirement(package, metric))
 
     finite = np.isfinite(image)
-    x = np.where(finite, as_float32("image", image), 0)
-    r = as_float32("reference", reference)
+    x = np.where(finite, as_float32("image", image), np.float32(0))
+    r = as_float32("reference", reference).copy()  # FLIP takes no array that is read-only
     displayed_x, displayed_r = ldr_from_radiance(x), ldr_from_radiance(r)
     reference_mean = float(r.mean(dtype=np.float64))
     return Comparison(
