@@ -300,6 +300,23 @@ def test_results_with_a_name_that_is_no_text_are_told(folder, tmp_path):
     assert picture.exists()
 
 
+def test_names_beyond_ascii_are_read_and_written_in_any_locale(folder, tmp_path):
+    given, picture = folder.rename(tmp_path / "räume"), tmp_path / "größe.exr"
+    options = ["denoise", str(given), "-o", str(picture), "--preset", "draft", "--iterations", "2"]
+    program = [sys.executable, "-c", MAIN.format("tungsten_dip"), *options]
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    for name in ("page.html", "größe.html"):
+        done = subprocess.run(
+            [*program, "--report", str(tmp_path / name)],
+            capture_output=True,
+            check=False,
+            env={**os.environ, **ascii_only},
+        )
+        assert done.returncode == 0, done.stderr
+        assert picture.exists()
+        assert (tmp_path / name).exists()
+
+
 def test_an_error_map_is_written_where_no_network_was_fitted(tmp_path, render, capfd):
     clean = Buffer(render.reference, render.reference, render.reference * np.float32(1.0001))
     write_tungsten_folder(tmp_path / "clean", RenderBuffers(clean))

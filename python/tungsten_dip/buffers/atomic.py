@@ -62,7 +62,9 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
             raise InputError(f"{path}: expected the name of a file, this is a folder")
         target = _resolved(path)
         if path.suffix.lower() in _BY_OPENIMAGEIO and not is_utf8(target.parent):
-            raise InputError(f"{path}: expected a folder with a name in UTF-8 for {suffix}; choose another")
+            raise InputError(
+                f"{path}: expected a folder with a name in UTF-8 for {path.suffix}; choose another"
+            )
         temporary = _temporary(target)
         temporary.open("xb").close()
         temporary.unlink(missing_ok=True)  # as another process may have done, which took its writer for dead
@@ -71,8 +73,12 @@ def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
 
 
 def is_utf8(path: Path) -> bool:
-    """Return whether a path is UTF-8; Python keeps other bytes as lone surrogates."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))
+    """Return whether the bytes of a path are UTF-8, whatever the locale takes them for."""
+    try:
+        os.fsencode(path).decode()
+    except UnicodeError:
+        return False
+    return True
 
 
 def _resolved(path: Path) -> Path:
@@ -89,8 +95,8 @@ def _temporary(target: Path) -> Path:
 
 
 def _prefix(target: Path) -> str:
-    """Return what the names of temporary files begin with: the stem, cut lest they be too long."""
-    return f".{os.fsencode(target.stem)[:_MOST_OF_STEM_BYTES].decode(errors='ignore')}-"
+    """Return what the names of temporary files begin with: the stem's ASCII, cut lest they be too long."""
+    return f".{os.fsencode(target.stem)[:_MOST_OF_STEM_BYTES].decode('ascii', errors='ignore')}-"
 
 
 def _end(target: Path) -> str:
@@ -129,7 +135,7 @@ def _remove_left_by_the_dead(target: Path) -> None:
 
 
 _BY_OPENIMAGEIO = (".png", ".pfm", ".hdr")
-"""It takes paths in UTF-8 alone. The names of temporary files are always UTF-8, whatever the target's."""
+"""It takes paths in UTF-8 alone. The names of temporary files are ASCII, whatever the target's."""
 
 _TOKEN_BYTES = 4
 _MOST_OF_STEM_BYTES = 100

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import logging
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -111,7 +112,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     Raises InputError if it is damaged.
     """
     try:
-        header: dict[str, Any] = OpenEXR.File(str(path), header_only=True).parts[0].header
+        header: dict[str, Any] = OpenEXR.File(checked_name(path), header_only=True).parts[0].header
     except (IndexError, OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
     return header
@@ -216,8 +217,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")
     spec["pnm:pfmflip"] = 1
     with replacing(path) as temporary:
-        checked_name(temporary.parent)
-        name = str(temporary)
+        name = str(Path(checked_name(temporary.parent), temporary.name))
         output = oiio.ImageOutput.create(name)
         pixels = np.ascontiguousarray(image)
         if output is None:
@@ -235,10 +235,10 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
 
 
 def checked_name(path: Path) -> str:
-    """Return the path as OpenImageIO takes it. Raises InputError if the name is no UTF-8."""
+    """Return the path as OpenImageIO and OpenEXR take it. Raises InputError if the name is no UTF-8."""
     if not is_utf8(path):
         raise InputError(f"{path}: expected a name in UTF-8; rename it")
-    return str(path)
+    return os.fsencode(path).decode()  # which differs from the text in a locale that is not UTF-8
 
 
 def _decoded(path: Path) -> tuple[Part, ...]:
@@ -261,7 +261,7 @@ def _decoded(path: Path) -> tuple[Part, ...]:
         image.close()
     if path.suffix.lower() != ".exr":
         return tuple(parts)
-    headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+    headers = [part.header for part in OpenEXR.File(checked_name(path), header_only=True).parts]
     return tuple(
         Part(part.channels, {key: value for key, value in header.items() if key not in _ENCODING}, part.name)
         for part, header in zip(parts, headers, strict=True)
