@@ -326,6 +326,7 @@ def test_a_colour_whose_prefix_is_no_view_layer_has_the_features_of_any(tmp_path
         ({"color": "none"}, "no colour"),
         ({"depth": "odd"}, "expected 1 channels"),
         ({"normal": "Z"}, "expected 3 channels"),
+        ({"alpha": "odd"}, "alpha: expected 1 channels, found odd.R, odd.G, odd.B; choose with --map"),
         ({"albedoA": "odd"}, "no mean"),
     ],
 )
@@ -333,6 +334,14 @@ def test_a_wrong_map_is_refused(tmp_path: Path, mapping: dict[str, str], message
     save(tmp_path / "a.exr", *"RGB", *rgb("odd"), "two.u", "two.v", "Z")
     with pytest.raises(InputError, match=message):
         read_buffers(tmp_path / "a.exr", mapping)
+
+
+def test_alpha_may_be_spelled_out_as_the_colours_are(tmp_path: Path) -> None:
+    channels = save(tmp_path / "a.exr", *(f"beauty.{name}" for name in ("red", "green", "blue", "alpha")))
+    buffers = read_buffers(tmp_path / "a.exr")
+    assert holds(buffers.color, channels, "beauty.red", "beauty.green", "beauty.blue")
+    assert buffers.alpha is not None
+    assert np.array_equal(buffers.alpha[..., 0], channels["beauty.alpha"])
 
 
 def test_parts_are_layers(tmp_path: Path) -> None:
@@ -694,7 +703,7 @@ def test_sizes_must_agree(tmp_path: Path) -> None:
         read_buffers(tmp_path)
     window = np.array([2, 0], "i"), np.array([8, 4], "i")
     save(tmp_path / "normal.exr", *"RGB", dataWindow=window)
-    with pytest.raises(InputError, match=r"got 7 x 5 pixels from \(2, 0\)"):
+    with pytest.raises(InputError, match=r"got 7 x 5 pixels from \(2, 0\); bring all to one data window"):
         read_buffers(tmp_path)
     save_parts(tmp_path / "p.exr", rgba={n: pixels(0) for n in "RGB"}, depth={"Z": pixels(0, width=9)})
     refused(tmp_path / "p.exr", "expected 7 x 5")

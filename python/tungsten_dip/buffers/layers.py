@@ -92,8 +92,8 @@ def find_layers(channel_names: Iterable[str], mapping: Mapping[str, str], defaul
         found = _listed(layers) or "nothing"
         raise InputError(f"no colour: expected R, G, B or layer color, found {found}; use --map color=LAYER")
     alpha = _alpha(channels["color"], names, layers, mapping)
-    if alpha is not None:
-        channels["alpha"] = (alpha,)
+    if alpha:
+        channels["alpha"] = alpha
     spp = _match("spp", layers, color_prefix)
     if spp is not None:
         channels["spp"] = _ordered(layers[spp])
@@ -254,9 +254,10 @@ def _add_planes(
 
 def _alpha(
     color: tuple[str, ...], names: list[str], layers: Layers, mapping: Mapping[str, str]
-) -> str | None:
+) -> tuple[str, ...]:
     if "alpha" in mapping:
-        return None if mapping["alpha"] == NOTHING else _mapped("alpha", mapping["alpha"], names, layers)[0]
+        return () if mapping["alpha"] == NOTHING else _mapped("alpha", mapping["alpha"], names, layers)
     # Of two spellings, such as R and r, only one is in the layers.
     own = next((components for components in layers.values() if color[0] in components.values()), {})
-    return own.get("A") or layers.get("", {}).get("A")
+    alpha = own.get("A") or own.get("ALPHA") or layers.get("", {}).get("A")
+    return () if alpha is None else (alpha,)

@@ -410,7 +410,10 @@ def _sizes_differ(label: str, part: Part, color: Part) -> str:
         f"{width} x {height} pixels from ({column}, {row})"
         for column, row, width, height in (part.window, color.window)
     )
-    return f"{label}: expected {expected} as the colour has, got {got}; render all at one size"
+    remedy = (
+        "bring all to one data window" if part.window[2:] == color.window[2:] else "render all at one size"
+    )
+    return f"{label}: expected {expected} as the colour has, got {got}; {remedy}"
 
 
 def _names(files: Iterable[Path]) -> str:
