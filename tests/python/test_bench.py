@@ -85,6 +85,9 @@ def test_a_reference_is_found_in_the_folder_above_it_or_where_it_is_named(folder
         read_sets([str(folder)])
     (same,) = read_sets([f"{folder}={named}"])
     assert same.digest == bench_set.digest
+    (folder.parent / "p=1").mkdir()
+    in_folder = named.rename(folder.parent / "p=1" / "truth.exr")
+    assert read_sets([f"{folder}={in_folder}"])[0].digest == bench_set.digest
     write_image(folder / "reference.exr", bench_set.reference * 2)
     assert read_sets([str(folder)])[0].digest != bench_set.digest
 

@@ -122,10 +122,11 @@ def _bench_set(name: str, buffers: RenderBuffers, reference: FloatImage, nfor: F
 
 
 def _paths(text: str) -> tuple[Path, Path]:
-    """Take apart ``INPUT=REFERENCE``; a file that has ``=`` in its name is an input."""
-    path, separator, reference = text.rpartition("=")
-    if separator and not Path(text).exists():
-        return Path(path), Path(reference)
+    """Take apart ``INPUT=REFERENCE``, where both exist if names have more ``=``; what exists is an input."""
+    parts = text.split("=")
+    pairs = [(Path("=".join(parts[:i])), Path("=".join(parts[i:]))) for i in range(1, len(parts))]
+    if pairs and not Path(text).exists():
+        return next((pair for pair in pairs if all(path.exists() for path in pair)), pairs[-1])
     folder = _folder(Path(text))
     for candidate in (folder / REFERENCE, folder.resolve().parent / REFERENCE):
         if candidate.exists():
