@@ -223,7 +223,8 @@ def _denoised(
     }
     known = result.estimated_relmse is not None
     error = f", estimated relMSE {result.estimated_relmse:.3g}" if known else ""
-    return facts, f"{options.output}: {result.iterations} iterations in {result.seconds:.1f} s{error}"
+    steps = "iteration" if result.iterations == 1 else "iterations"
+    return facts, f"{options.output}: {result.iterations} {steps} in {result.seconds:.1f} s{error}"
 
 
 def _inspect(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -255,6 +256,12 @@ def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
 
 def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     image, reference = read_image(options.image), read_image(options.reference)
+    if image.shape != reference.shape:
+        (height, width), (rows, columns) = image.shape[:2], reference.shape[:2]
+        raise InputError(
+            f"{options.image}: expected {columns} x {rows} pixels as {options.reference} has, got {width} x "
+            f"{height}; bring both to one size"
+        )
     begin, expected = first_pixel(options.image), first_pixel(options.reference)
     if begin != expected and None not in (begin, expected):
         raise InputError(
