@@ -3,6 +3,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import signal
 import sys
 from dataclasses import asdict, replace
@@ -394,8 +395,9 @@ def test_settings_are_told_by_what_is_not_the_default():
 
 
 def command_of(tmp_path, body):
-    path = tmp_path / "denoiser"
-    path.write_text(f"#!{sys.executable}\nimport json, shutil, sys\nfrom pathlib import Path\n{body}\n")
+    path, program = tmp_path / "denoiser", tmp_path / "denoiser.py"
+    program.write_text(f"import json, shutil, sys\nfrom pathlib import Path\n{body}\n")
+    path.write_text(f'#!/bin/sh\nexec {shlex.join([sys.executable, str(program)])} "$@"\n')
     path.chmod(0o755)
     return path
 
