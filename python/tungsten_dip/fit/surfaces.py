@@ -14,8 +14,8 @@ from tungsten_dip.buffers.prefilter import prefilter_features
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
-# far away. The scale of the depth makes its differences large beside the ridge of the regression: along a wall
-# the light changes with the distance, which therefore has to explain it.
+# far away. The depth's scale makes its differences large beside the ridge of the regression: along a wall the
+# light changes with the distance, which has to explain it.
 _NORMAL_PENALTY = 3.0
 _ALBEDO_PENALTY = 20.0
 _DEPTH_PENALTY = 0.14

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from tungsten_dip.buffers.model import RenderBuffers
-from tungsten_dip.errors import InputError, check_choice
+from tungsten_dip.errors import check_choice
 from tungsten_dip.hosts import tungsten
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.progress import Progress, silent
