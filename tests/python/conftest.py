@@ -1,4 +1,4 @@
-"""A small synthetic render whose ground truth and noise are known, for every test that needs buffers."""
+"""A small synthetic render with known truth and noise, and what replaces fits and renders of commands."""
 
 from __future__ import annotations
 

@@ -437,7 +437,7 @@ def test_ctrl_c_in_the_fit_of_a_preview_ends_the_render(tmp_path, fits, render, 
     outputs = tungsten.SceneOutputs(tmp_path / "room.png", tmp_path / "room.exr")
     preview = tungsten._preview(outputs, FitSettings())
     with pytest.raises(KeyboardInterrupt):
-        preview(tungsten.tungsten_host.Rendered(render.buffers, None, None, "gamma"))
+        preview(tungsten.tungsten_host.Rendered(render.buffers, None, "gamma"))
     assert (tmp_path / "room_preview.png").exists()
 
 

@@ -311,8 +311,9 @@ def default(set_default, value, before):
         lambda: torch.device("meta"),
         lambda: default(torch.set_default_dtype, torch.float64, torch.float32),
         lambda: default(torch.set_default_device, "meta", None),
+        lambda: torch.autocast("cpu", dtype=torch.bfloat16),
     ],
-    ids=["no_grad", "inference_mode", "device", "default dtype", "default device"],
+    ids=["no_grad", "inference_mode", "device", "default dtype", "default device", "autocast"],
 )
 @pytest.mark.parametrize("network", ["skip", "resnet"])
 def test_the_callers_settings_of_torch_change_nothing(context, network):

@@ -235,6 +235,11 @@ def test_a_refused_run_leaves_no_folder(frames):
     assert not (frames / "out").exists()
 
 
+def test_page_and_network_may_lie_in_the_new_folder_of_the_frames(frames):
+    assert main(arguments("--report", "out/page.html", "--save-model", "out/model.onnx")) == 0
+    assert {"page.html", "model.onnx"} <= {file.name for file in (frames / "out").iterdir()}
+
+
 def test_a_killed_run_loses_the_frame_in_hand_alone(frames):
     (frames / "out").mkdir()
     (frames / "out/.f0003-0123abcd.exr").write_bytes(b"left by an earlier kill")

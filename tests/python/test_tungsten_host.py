@@ -335,12 +335,24 @@ def test_checkpoints_are_previewed_and_a_failing_preview_does_not_stop_the_rende
         if len(seen) == 2:
             raise ValueError("no preview")
 
-    with pytest.raises(ValueError, match="no preview"):
-        tungsten.drive(write_scene(), options, on_checkpoint=preview)
+    rendered = tungsten.drive(write_scene(), options, on_checkpoint=preview)
+    assert str(rendered.failure) == "no preview"
     assert [buffers.spp for buffers in seen] == [4, 8]
     assert seen[0].color.half_a.flags.writeable
     assert "the render goes on without" in caplog.text
     assert {"picture.png", "picture_checkpoint.png"} <= {file.name for file in (tmp_path / "out").iterdir()}
+
+
+@in_process
+def test_ctrl_c_in_a_preview_ends_the_render_with_what_there_is(write_scene, tmp_path):
+    def preview(rendered):
+        raise KeyboardInterrupt
+
+    options = tungsten.DriverOptions(spp=16, checkpoint_interval_s=1e-9, output_directory=tmp_path)
+    rendered = tungsten.drive(write_scene(), options, on_checkpoint=preview)
+    assert rendered.interrupted
+    assert rendered.buffers.spp == 4
+    assert (tmp_path / "picture.png").exists()
 
 
 @in_process

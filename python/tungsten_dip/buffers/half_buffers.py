@@ -21,8 +21,8 @@ _FOREIGN_SHARE = 0.05
 """Part of the pixels that may lie further away. In renders it is below 0.01."""
 
 _EMPTY_SHARE = 0.5
-"""Part of the pixels in which half B may be empty. Of Tungsten's albedo, which paths lost in glass do not
-reach, it is 0.06 at 2 samples per pixel; of one light's image that passes for half B, nearly all."""
+"""Part of the pixels in which half B may be empty: 0.06 of Tungsten's albedo at 2 samples per pixel, which
+paths lost in glass do not reach. Where the image of a single light is mistaken for half B, it is nearly 1."""
 
 _ENOUGH_PIXELS = 1 << 14
 
@@ -63,7 +63,7 @@ def _halves_belong(buffer: Buffer) -> bool:
     """Whether nearly every pixel is the mean of its halves, except for rounding and halves of unequal size.
 
     Pixels that are 0 in all three, which most of an image may be, and those that are not finite, are ignored,
-    and so are some whose only sample is in half A.
+    and so are those whose only sample is in half A, up to `_EMPTY_SHARE` of them.
     """
     if buffer.halves is None:
         return True

@@ -289,7 +289,7 @@ def _part(path: Path, image: Any, index: int) -> Part:
     suffix = path.suffix.lower()
     if image.format_name() != _FORMATS.get(suffix, image.format_name()):
         raise InputError(
-            f"{path}: expected {suffix} data, got {image.format_name()}; rename it as what it is"
+            f"{path}: expected {suffix} data, got {image.format_name()}; rename it with its own suffix"
         )
     if suffix == ".pfm":
         _check_pfm(path)

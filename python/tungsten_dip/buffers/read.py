@@ -35,7 +35,7 @@ from tungsten_dip.buffers.layers import (
 )
 from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
-from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file
 
 _LOG = logging.getLogger(__name__)
@@ -61,8 +61,8 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     """
     path = Path(path)
     if mapping is not None:
-        check_type("mapping", mapping, dict, 'use one such as {"color": "beauty"}')
-    mapping = {str(key): str(value) for key, value in (mapping or {}).items()}
+        _check_mapping(mapping)
+    mapping = dict(mapping or {})
     if is_folder(path):
         excluded = {key: value for key, value in mapping.items() if value == NOTHING}
         return _from_images(path, *_files_of_folder(path, mapping), excluded)
@@ -72,6 +72,15 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
         return _from_images(path, *_files_of_scene(path), {})
     source, attributes = _unwrapped(path, read_parts(path))
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
+
+
+def _check_mapping(mapping: Any) -> None:
+    expected = 'a dictionary of texts such as {"color": "beauty"}'
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"mapping: expected {expected}, got {type(mapping).__name__}")
+    for text in (*mapping.keys(), *mapping.values()):
+        if not isinstance(text, str):
+            raise InputError(f"mapping: expected {expected}, got {type(text).__name__} in it")
 
 
 def read_image(path: str | Path) -> FloatImage:

@@ -89,18 +89,16 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
     check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
-    check_suffix(frames[0].output)
-    if options.report is not None:
-        check_writable(options.report, (".html",))
-    if options.save_model is not None:
-        check_writable(options.save_model, (".onnx",))
+    results = [(frames[0].output, ".exr"), (options.report, ".html"), (options.save_model, ".onnx")]
+    for file, suffix in results:
+        if file is not None:
+            check_suffix(file, (suffix,))
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
     run = Run(settings, options.refit, dict(options.map), options.float16, digest)
     models = Models(first=warm_start)
-    frames[0].output.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(frames[0].output)
+    _make_writable(frames[0].output.parent, results)
 
     with _without_repetition(), progress_on_stderr("denoising") as progress:
         if options.scheduler == "local" and workers == 1:
@@ -131,6 +129,20 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     before = f"; {skipped} {'was' if skipped == 1 else 'were'} finished before" if skipped else ""
     frame_or_frames = "frame" if len(done) == 1 else "frames"
     return facts, f"{len(done)} {frame_or_frames}, denoised in {seconds:.1f} s in all{before}"
+
+
+def _make_writable(folder: Path, results: Sequence[tuple[Path | None, str]]) -> None:
+    """Make the folder of the frames; none is left of a run whose results cannot be saved."""
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        for file, suffix in results:
+            if file is not None:
+                check_writable(file, (suffix,))
+    except InputError:
+        if is_new:
+            folder.rmdir()
+        raise
 
 
 def _input_files(frames: Sequence[Frame], mapping: dict[str, str]) -> Iterator[Path]:

@@ -284,7 +284,7 @@ def _render_with_tungsten(
 ) -> tuple[RenderBuffers, SceneOutputs]:
     """Render a scene; return its buffers, and what Tungsten has not written of its outputs.
 
-    Raises KeyboardInterrupt if Ctrl-C ended the render, with all outputs written.
+    Raises KeyboardInterrupt if Ctrl-C ended the render, and what a preview raised, with all outputs written.
     """
     preview = _preview(outputs, settings) if options.dip_preview else None
     before = {path: _last_written(path) for path, _ in outputs.files()}
@@ -303,9 +303,9 @@ def _render_with_tungsten(
             if buffer.hdr_output_file and is_unwritten(Path(buffer.hdr_output_file))
         ),
     )
-    if rendered.interrupted:
+    if rendered.interrupted or rendered.failure is not None:
         write_render(rendered.buffers, unwritten, rendered.tonemap)
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt if rendered.failure is None else rendered.failure
     return rendered.buffers, unwritten
 
 

@@ -87,7 +87,7 @@ def error_from_halves(targets: Halves, fused: Halves, epsilon: np.float32) -> tu
     return mean_and_standard_error(channel_mean(relative_error(of_one - variance, denominator)))
 
 
-def crossed_errors(noisy: Halves, fused: Halves) -> Halves:
+def crossed_errors(noisy: Halves, fused: Halves) -> tuple[FloatArray, FloatArray]:
     """Return the squared error of one half's result in the mean, and the variance of the mean of both.
 
     ``noisy`` are independent images a, b of the truth r, and ``fused`` the results f_a, f_b of one of them

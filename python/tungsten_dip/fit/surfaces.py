@@ -95,7 +95,7 @@ def surfaces_of_halves(
     """Pre-filter, scale and select the features of sanitised buffers; return the surfaces of every colour.
 
     ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
-    shape (height, width, 3). Those of a half are computed from its own samples alone (the other half
+    shape (height, width, 3). The surfaces of a half are computed from its own samples alone (the other half
     only determines which of them are averaged), since errors that a half's features share with the colour
     that scores them would be mistaken for signal. Features without halves, and alpha, which has none, are the
     exception.

@@ -11,7 +11,7 @@ import importlib
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +65,17 @@ class DriverOptions:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A render, finished, ended by Ctrl-C or at a checkpoint, and the files (absolute) it has in Tungsten."""
+    """A render: finished, ended by Ctrl-C, or at a checkpoint.
+
+    ``output_file`` is the absolute path of the picture that Tungsten writes of it, ``failure`` what
+    `drive`'s ``on_checkpoint`` raised.
+    """
 
     buffers: RenderBuffers
     output_file: Path | None
-    hdr_output_file: Path | None
     tonemap: TonemapName
     interrupted: bool = False
+    failure: Exception | None = None
 
 
 def available() -> bool:
@@ -123,10 +127,11 @@ def drive(
     differences: the sampler is independent, every buffer that guides a fit is rendered, and the state
     that can be resumed is kept in a file of its own (``_dip`` added to its name), since other buffers are
     in it. ``on_checkpoint`` is given a copy of what is known at each checkpoint; if it fails, the render
-    goes on without it and the error is raised at the end.
+    goes on without it, and its error is the result's ``failure``.
 
     Whatever happens, the files that Tungsten can write are written before this returns or raises. The first
-    Ctrl-C ends the render after the pass in hand (``interrupted``), a second one ends the process.
+    Ctrl-C ends the render after the pass in hand or in ``on_checkpoint`` (``interrupted``), a second one
+    during a pass ends the process.
 
     Raises InputError if Tungsten cannot load or render the scene, or is not there.
     """
@@ -134,10 +139,9 @@ def drive(
     session = _load(Path(scene_path), options)
     plan = session.plan
 
-    def rendered(arrays: _Arrays, interrupted: bool = False) -> Rendered:
+    def rendered(arrays: _Arrays) -> Rendered:
         output_file = Path(plan.output_file) if plan.output_file else None
-        hdr_output_file = Path(plan.hdr_output_file) if plan.hdr_output_file else None
-        return Rendered(_buffers(plan, arrays), output_file, hdr_output_file, plan.tonemap, interrupted)
+        return Rendered(_buffers(plan, arrays), output_file, plan.tonemap)
 
     failure: Exception | None = None
 
@@ -153,12 +157,14 @@ def drive(
 
     try:
         interrupted = _render_passes(session, Path(scene_path), options, checkpoint, progress)
+    except KeyboardInterrupt:
+        if session.current_spp == 0:
+            raise
+        interrupted = True
     finally:
         if session.current_spp > 0:
             session.save_outputs()
-    if failure is not None and not interrupted:
-        raise failure
-    return rendered(session.take_buffers(), interrupted)
+    return replace(rendered(session.take_buffers()), interrupted=interrupted, failure=failure)
 
 
 def _load(scene: Path, options: DriverOptions) -> Any:

@@ -96,7 +96,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         "format": _FORMAT,
         "version": model.version,
         "kind": model.kind,
-        "planes": model.inputs,
+        "inputs": model.inputs,
         "settings": {name: getattr(model.settings, name) for name in _SETTINGS},
         "estimated_relmse": model.estimated_relmse,
         "source_sha256": model.source_sha256,
@@ -207,7 +207,7 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
     hints = get_type_hints(FitSettings)
     settings = FitSettings(**{name: _checked(name, chosen.get(name), hints[name]) for name in _SETTINGS})
     relmse = _checked("estimated_relmse", facts.get("estimated_relmse"), float | None)
-    inputs = _checked("planes", facts.get("planes"), tuple[str, ...])
+    inputs = _checked("inputs", facts.get("inputs"), tuple[str, ...])
     version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))
     layout = standardisation = None
     if kind == "pointwise":

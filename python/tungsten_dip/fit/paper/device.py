@@ -25,7 +25,7 @@ def check_torch_device(device: str) -> None:
 def compute_device(settings: FitSettings) -> Iterator[torch.device]:
     """Yield the device of the settings; meanwhile, torch uses their number of threads.
 
-    Gradients are on and tensors are made on the CPU unless they say where, whatever the caller's contexts.
+    Gradients are on, whatever the caller's contexts.
 
     Raises InputError if torch cannot compute on the device.
     """
@@ -34,7 +34,7 @@ def compute_device(settings: FitSettings) -> Iterator[torch.device]:
     threads_before = torch.get_num_threads()
     torch.set_num_threads(thread_count(settings.threads))
     try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.device("cpu"):
+        with torch.inference_mode(False), torch.enable_grad():
             yield torch.device("cuda" if use_cuda else "cpu")
     finally:
         torch.set_num_threads(threads_before)
@@ -42,11 +42,11 @@ def compute_device(settings: FitSettings) -> Iterator[torch.device]:
 
 @contextmanager
 def seeded_layers(seed: int) -> Iterator[None]:
-    """Let layers that are made meanwhile have float32 weights drawn with this seed.
+    """Let layers that are made meanwhile have float32 weights on the CPU, drawn with this seed.
 
-    Both are global in torch: one thread at a time, and afterwards they are as before.
+    Type and seed are global in torch: one thread at a time, and afterwards they are as before.
     """
-    with _MAKING_LAYERS, torch.random.fork_rng(devices=[]):
+    with _MAKING_LAYERS, torch.random.fork_rng(devices=[]), torch.device("cpu"):
         dtype = torch.get_default_dtype()
         torch.set_default_dtype(torch.float32)
         torch.default_generator.manual_seed(seed)

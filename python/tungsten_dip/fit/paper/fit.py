@@ -59,9 +59,12 @@ class PaperFit:
         generator = torch.Generator().manual_seed(settings.seed)
 
         # Rounding to bfloat16 is far below the noise that every iteration adds to the input. Sums stay in
-        # float32, and so do weights.
+        # float32, and so do weights. Within a caller's autocast its cache would outlive an iteration and keep
+        # the weights of the first.
         dtype = convolution_dtype(device)
-        self._precision = torch.autocast(device.type, dtype, enabled=dtype != torch.float32)
+        self._precision = torch.autocast(
+            device.type, dtype, enabled=dtype != torch.float32, cache_enabled=False
+        )
         fixed = torch.from_numpy(network_input(images, settings.seed))
         channels = fixed.shape[2]
         self._input = _nchw(fixed.to(device, dtype))
@@ -70,7 +73,8 @@ class PaperFit:
         # is a window of this pool at a place drawn anew, so that a pixel gets the same value twice only by
         # chance.
         pool_size = fixed.numel() + _NOISE_WINDOWS * _NOISE_STRIDE
-        self._noise_pool = torch.randn(pool_size, generator=generator, dtype=torch.float32).to(device, dtype)
+        pool = torch.randn(pool_size, generator=generator, dtype=torch.float32, device="cpu")
+        self._noise_pool = pool.to(device, dtype)
         self._generator = generator
 
         self._wanted = _nchw(torch.from_numpy(images.wanted).to(device))
@@ -92,7 +96,8 @@ class PaperFit:
 
     def step(self) -> None:
         """Do one iteration."""
-        window = _NOISE_STRIDE * int(torch.randint(_NOISE_WINDOWS, (), generator=self._generator))
+        place = torch.randint(_NOISE_WINDOWS, (), generator=self._generator, device="cpu")
+        window = _NOISE_STRIDE * int(place)
         noise = self._noise_pool[window : window + self._input.numel()]
         noise = noise.view(self._input.permute(0, 2, 3, 1).shape).permute(0, 3, 1, 2)
         torch.add(self._input, noise, alpha=INPUT_NOISE_STD, out=self._noisy_input)

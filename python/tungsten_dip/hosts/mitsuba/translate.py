@@ -59,7 +59,7 @@ def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
         if node is not None:
             t.add("emitter", node)
             lights += 1
-    _tell_of_replacement(t, scene.integrator, lights + len(surroundings))
+    _log_replacement(t, scene.integrator, lights + len(surroundings))
     if surroundings:
         t.add("emitter", together(surroundings))
     elif not lights:
@@ -75,7 +75,7 @@ def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
     )
 
 
-def _tell_of_replacement(t: Translation, integrator: ts.Integrator, lights: int) -> None:
+def _log_replacement(t: Translation, integrator: ts.Integrator, lights: int) -> None:
     """Log that another integrator is replaced, if it is: as a warning where the picture differs.
 
     Tungsten's paths from several lights have weights that sum to less than 1: those that hit a light ignore
