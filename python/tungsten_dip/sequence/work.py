@@ -101,7 +101,7 @@ def split_finished(frames: Iterable[Frame], run: Run) -> tuple[list[Frame], list
 def denoise_frames(
     frames: Iterable[Frame],
     run: Run,
-    models: Models = Models(),  # noqa: B008 - it is frozen
+    models: Models = Models(),
     progress: Progress = silent,
     tell: Callable[[Record], None] = lambda _: None,
 ) -> tuple[list[Record], Models]:
