@@ -441,6 +441,23 @@ def test_ctrl_c_in_the_fit_of_a_preview_ends_the_render(tmp_path, fits, render, 
     assert (tmp_path / "room_preview.png").exists()
 
 
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_ctrl_c_and_a_failed_preview_lose_no_file_of_the_render(
+    interrupted, tmp_path, render, monkeypatch, capfd
+):
+    def drive(path, options, on_checkpoint, progress):
+        failure = InputError("no preview")
+        return tungsten.tungsten_host.Rendered(render.buffers, None, "gamma", interrupted, failure)
+
+    monkeypatch.setattr(tungsten.tungsten_host, "in_process", lambda: True)
+    monkeypatch.setattr(tungsten.tungsten_host, "drive", drive)
+    scene = write_scene(tmp_path / "scene.json", hdr_output_file="room.exr")
+    options = ["--host", "tungsten", "--dip-denoise", "--dip-preview", "-d", str(tmp_path), str(scene)]
+    assert tungsten.main(options) == (130 if interrupted else 2)
+    assert ("no preview" in capfd.readouterr().err) != interrupted
+    assert (tmp_path / "room.exr").exists()
+
+
 def test_a_fit_that_ended_early_ends_the_command(tmp_path, renders, fits, monkeypatch):
     scenes = [write_scene(tmp_path / f"{name}.json", output_file=f"{name}.png") for name in ("one", "two")]
     finished = denoising.denoise

@@ -303,9 +303,10 @@ def _render_with_tungsten(
             if buffer.hdr_output_file and is_unwritten(Path(buffer.hdr_output_file))
         ),
     )
-    if rendered.interrupted or rendered.failure is not None:
+    stop = KeyboardInterrupt() if rendered.interrupted else rendered.failure
+    if stop is not None:
         write_render(rendered.buffers, unwritten, rendered.tonemap)
-        raise KeyboardInterrupt if rendered.failure is None else rendered.failure
+        raise stop
     return rendered.buffers, unwritten
 
 
