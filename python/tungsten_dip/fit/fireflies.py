@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves
+from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
 from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8
@@ -105,11 +105,11 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     height, width = taken[0].shape[:2]
     radius = max(height, width) // 4
     pixels = np.outer(_extents(height, radius), _extents(width, radius))[:, :, None]
-    mean = _core.box_mean(np.float32(0.5) * (taken[0] + taken[1]), radius, threads)
+    mean = _core.box_mean(mean_of((taken[0], taken[1])), radius, threads)
     squares = _core.box_mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
     certain = np.maximum(mean - np.float32(_SURELY) * np.sqrt(squares / pixels), 0)
     a, b = (channel_mean(half) for half in halves)
-    level = _core.box_mean(np.float32(0.5) * (a + b), _RADIUS, threads)
+    level = _core.box_mean(mean_of((a, b)), _RADIUS, threads)
     noise = _core.box_mean(np.abs(a - b), _RADIUS, threads)
     share = noise / np.maximum(_core.box_mean(noise, radius, threads), np.float32(_LEAST))
     gain = 1 + certain * share / np.maximum(level, np.float32(_LEAST))
