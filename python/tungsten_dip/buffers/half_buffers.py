@@ -53,7 +53,8 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
         if name != "visibility" and not _halves_belong(buffer)  # no fit uses it
     }
     lines = tuple(
-        f"{name}: the half buffers are not used: their mean is not the image, so they are of another image"
+        f"{name}: the half buffers are not used, because their mean is not the image: they are of another "
+        "one, or of a single sample per pixel"
         for name in alone
     )
     return buffers.with_quantities(**alone), lines
