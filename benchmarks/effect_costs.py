@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Quantity
+from tungsten_dip.buffers.render_buffers import Quantity
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.mitsuba.render import QUANTITIES, render
 from tungsten_dip.scene.parse import load_scene

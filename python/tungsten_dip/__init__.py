@@ -16,8 +16,8 @@ from tungsten_dip.interrupts import held_interrupts
 
 if TYPE_CHECKING:
     from tungsten_dip.buffers.image_file import write_image
-    from tungsten_dip.buffers.model import Buffer, RenderBuffers
     from tungsten_dip.buffers.read import read_buffers, read_image
+    from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
     from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     __version__: str
 
 _MODULE_BY_NAME = {
-    "Buffer": "buffers.model",
+    "Buffer": "buffers.render_buffers",
     "Comparison": "report.metrics",
     "FitResult": "fit.result",
     "FitSettings": "fit.settings",
     "HistoryPoint": "fit.result",
     "InputError": "errors",
     "Model": "fit.model",
-    "RenderBuffers": "buffers.model",
+    "RenderBuffers": "buffers.render_buffers",
     "compare": "report.metrics",
     "denoise": "fit",
     "infer": "onnx",

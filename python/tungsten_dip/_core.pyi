@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Quantity
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Quantity
 
 INFINITE_DEPTH: float
 """A depth from here on counts as infinite: the sky."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import SyntheticRender
-from tungsten_dip.buffers.model import Buffer, FloatArray, Halves
+from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, Halves
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.error import estimate_error, held_out_error
 

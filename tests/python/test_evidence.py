@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender
-from tungsten_dip.buffers.model import Buffer, Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
 from tungsten_dip.fit.evidence import Evidence, _noises
 from tungsten_dip.fit.exposure import unscaled

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tungsten_dip import hosts
-from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts import memory, tungsten
 from tungsten_dip.hosts.mitsuba.render import render

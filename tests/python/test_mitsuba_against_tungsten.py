@@ -16,8 +16,8 @@ import numpy as np
 import OpenImageIO
 import pytest
 
-from tungsten_dip.buffers.model import Buffer
 from tungsten_dip.buffers.read import read_buffers
+from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.hosts.mitsuba.render import render
 from tungsten_dip.scene.parse import load_scene
 

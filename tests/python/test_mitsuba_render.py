@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers import read_buffers, write_denoised
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings

@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tungsten_dip.buffers.display import ldr_from_radiance, radiance_from_ldr  # noqa: E402
-from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers  # noqa: E402
+from tungsten_dip.buffers.render_buffers import CHANNELS, Buffer, RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.fit import denoise  # noqa: E402
 from tungsten_dip.fit.paper.fit import BACKTRACK_DB, INPUT_NOISE_STD, PaperFit, fit_paper, learning_rate  # noqa: E402

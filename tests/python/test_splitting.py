@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.splitting import with_independent_halves
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender, SyntheticRender
-from tungsten_dip.buffers.model import Indices
+from tungsten_dip.buffers.render_buffers import Indices
 from tungsten_dip.fit import FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.pointwise import HIDDEN, Examples, PointwiseNetwork

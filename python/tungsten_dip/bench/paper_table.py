@@ -21,7 +21,7 @@ from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.paper.constants import ITERATIONS

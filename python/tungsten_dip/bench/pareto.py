@@ -13,7 +13,7 @@ from tungsten_dip.bench.plot import write_pareto_plot
 from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet, cropped
 from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.extras import require
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.oidn import oidn_image

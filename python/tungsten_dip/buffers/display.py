@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Quantity
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Quantity
 
 _GAMMA = 2.2
 

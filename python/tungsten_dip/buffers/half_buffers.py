@@ -6,7 +6,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
-from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 __all__ = ["HalvesTest", "compare_halves", "without_foreign_halves"]

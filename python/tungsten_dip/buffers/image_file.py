@@ -23,7 +23,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import is_utf8, replacing
-from tungsten_dip.buffers.model import FloatArray, Quantity, as_float32, check_array
+from tungsten_dip.buffers.render_buffers import FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError

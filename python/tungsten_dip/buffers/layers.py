@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from tungsten_dip.buffers.model import CHANNELS
+from tungsten_dip.buffers.render_buffers import CHANNELS
 from tungsten_dip.errors import InputError
 
 ALIASES = {

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 1, 0.35), (4, 2, 0.5), (5, 1, 0.7))

@@ -33,7 +33,7 @@ from tungsten_dip.buffers.layers import (
     names_quantity,
     planes_of_output,
 )
-from tungsten_dip.buffers.model import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError
 from tungsten_dip.json_file import object_from_json_file

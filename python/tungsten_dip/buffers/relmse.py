@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 RELMSE_EPSILON = 0.01
 """Keeps relMSE finite on black pixels; the value of Rousselle et al. 2011 (greedy error minimization)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 _PLANES = ("", " half A", " half B", " variance")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from tungsten_dip.buffers.model import Buffer
+    from tungsten_dip.buffers.render_buffers import Buffer
 
 OWN = "tungsten_dip/"
 """Prefix of the names of our own attributes."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
-from tungsten_dip.buffers.model import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
+from tungsten_dip.buffers.render_buffers import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError, check_type
 

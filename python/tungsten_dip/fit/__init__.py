@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from tungsten_dip.buffers.model import Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings

@@ -11,7 +11,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25

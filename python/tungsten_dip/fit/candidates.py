@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Halves, RenderBuffers, check_array
+from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers, check_array
 from tungsten_dip.errors import InputError
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock

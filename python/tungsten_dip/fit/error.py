@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, Halves, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+from tungsten_dip.buffers.render_buffers import FloatArray, Halves, mean_of
 
 _CHUNK_PIXELS = 1 << 18
 _BIAS = 2.4

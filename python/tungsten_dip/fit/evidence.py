@@ -10,8 +10,16 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FEATURES, Buffer, FloatImage, Halves, Indices, RenderBuffers, mean_of
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+from tungsten_dip.buffers.render_buffers import (
+    FEATURES,
+    Buffer,
+    FloatImage,
+    Halves,
+    Indices,
+    RenderBuffers,
+    mean_of,
+)
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.clock import Clock

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant of `fit` relies on it."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves, mean_of
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
 from tungsten_dip.fit.neighbours import mean_around
 
 _RADIUS = 8

@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 
-from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import (
     OUTLIER,

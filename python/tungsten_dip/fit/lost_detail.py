@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import FloatImage, Halves
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves
 
 _Floats = npt.NDArray[np.float64]
 

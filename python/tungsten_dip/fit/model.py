@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatArray, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FloatArray, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings

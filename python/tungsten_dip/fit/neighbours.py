@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 
 def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:

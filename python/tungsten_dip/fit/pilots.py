@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.model import FloatImage, Halves
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.surfaces import EDGES_RADIUS, Surfaces, along_edges
 

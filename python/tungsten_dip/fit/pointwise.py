@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import onnx
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Indices
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Indices
 from tungsten_dip.cores import in_parallel
 from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.model import Weights, check_finite

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
-from tungsten_dip.buffers.model import Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.candidates import checked_candidates, checked_previous

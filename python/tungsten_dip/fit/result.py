@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tungsten_dip.buffers.model import FloatImage, Halves
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitSettings
 

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
-from tungsten_dip.buffers.model import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import noise_in
+from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.neighbours import mean_around

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatArray
+from tungsten_dip.buffers.render_buffers import FloatArray
 from tungsten_dip.cores import in_pair
 
 LARGEST_INPUT = 4.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.model import Buffer, FloatImage, RenderBuffers, mean_of
 from tungsten_dip.buffers.prefilter import prefilter_features
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers, mean_of
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as

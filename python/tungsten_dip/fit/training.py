@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tungsten_dip.buffers.model import FloatArray, Halves, Indices
+from tungsten_dip.buffers.render_buffers import FloatArray, Halves, Indices
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error

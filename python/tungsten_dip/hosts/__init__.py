@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import Literal, get_args
 
-from tungsten_dip.buffers.model import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import check_choice
 from tungsten_dip.hosts import tungsten
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tungsten_dip.buffers.image_file import MAX_PIXELS
-from tungsten_dip.buffers.model import CHANNELS, Quantity
+from tungsten_dip.buffers.render_buffers import CHANNELS, Quantity
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import Scene
 

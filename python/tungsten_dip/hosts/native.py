@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.progress import Progress
 

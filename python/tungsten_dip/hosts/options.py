@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tungsten_dip.buffers.model import MOST_SPP
+from tungsten_dip.buffers.render_buffers import MOST_SPP
 from tungsten_dip.errors import whole_number
 
 RANGES = {"spp": (1, MOST_SPP), "seed": (0, 2**32 - 1), "threads": (1, 2**31 - 1)}

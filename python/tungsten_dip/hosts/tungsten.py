@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import CHANNELS, Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import CHANNELS, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large

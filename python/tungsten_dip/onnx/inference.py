@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.display import radiance_from_ldr
-from tungsten_dip.buffers.model import FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import denoise

@@ -16,7 +16,7 @@ from pathlib import Path
 from string import Template
 
 from tungsten_dip.buffers.image_file import write_image
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.report.preview import FALSE_COLORS
 
 

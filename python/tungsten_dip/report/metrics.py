@@ -10,8 +10,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_radiance
-from tungsten_dip.buffers.model import FloatImage, as_float32, check_array
 from tungsten_dip.buffers.relmse import relative_squared_error
+from tungsten_dip.buffers.render_buffers import FloatImage, as_float32, check_array
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import requirement
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
-from tungsten_dip.buffers.model import FEATURES, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, RenderBuffers
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import PAPER_SETTINGS
 from tungsten_dip.report import html

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 GAP_PX = 4
 """Width of the bar between two pictures side by side."""

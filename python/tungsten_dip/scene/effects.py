@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from tungsten_dip.buffers.model import Quantity
+from tungsten_dip.buffers.render_buffers import Quantity
 from tungsten_dip.scene.types import (
     AtmosphericMedium,
     Bsdf,

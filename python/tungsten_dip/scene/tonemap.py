@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_radiance
-from tungsten_dip.buffers.model import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import TonemapName
 

@@ -19,7 +19,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import Quantity
+from tungsten_dip.buffers.render_buffers import Quantity
 
 Vec3 = tuple[float, float, float]
 """A point, a direction or a linear RGB colour; a single number in the file means all three."""

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from tungsten_dip.buffers.model import Halves, RenderBuffers
 from tungsten_dip.buffers.prefilter import prefilter_feature
+from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.model import FloatArray, FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import in_pair
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import Camera, PerspectiveCamera

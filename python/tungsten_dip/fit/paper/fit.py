@@ -15,7 +15,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from tungsten_dip.buffers.display import radiance_from_ldr
-from tungsten_dip.buffers.model import FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.model import Model, Weights, check_finite, check_inputs, source_sha256
 from tungsten_dip.fit.paper.constants import ITERATIONS

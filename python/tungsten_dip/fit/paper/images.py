@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
-from tungsten_dip.buffers.model import Buffer, FloatImage, Quantity, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 

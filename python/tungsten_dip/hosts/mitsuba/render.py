@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.model import (
+from tungsten_dip.buffers.render_buffers import (
     CHANNELS,
     FEATURES,
     MOST_SPP,
