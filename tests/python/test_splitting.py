@@ -41,6 +41,18 @@ def test_other_seeds_and_images_are_split_otherwise() -> None:
     assert (share(buffers, 0) != share(other, 0)).mean() > 0.9
 
 
+def test_one_half_alone_has_a_firefly() -> None:
+    """Whatever the seed: in both halves it would pass for detail."""
+    color = np.random.default_rng(6).gamma(4, 0.25, (24, 32, 3)).astype(np.float32)
+    for value in (1e3, 1e6, 1e12, 1e30):
+        color[10, 12] = value
+        for seed in range(30):
+            halves = with_independent_halves(RenderBuffers(Buffer(color)), (), seed, 1).buffers.color.halves
+            assert halves is not None
+            pixel = np.sort([half[10, 12] for half in halves], axis=0)
+            np.testing.assert_array_equal(pixel, [[0] * 3, [np.float32(2 * value)] * 3])
+
+
 def test_what_has_no_noise_is_not_torn_apart() -> None:
     flat = RenderBuffers(Buffer(np.full((20, 30, 3), 0.7, np.float32)))
     halves = with_independent_halves(flat, (), 0, 1).buffers.color.halves

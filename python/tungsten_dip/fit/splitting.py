@@ -34,7 +34,8 @@ _NOISE_RADIUS = 1
 _CORRELATION_RADIUS = 8
 
 _LEAST_SHAPE = 1e-2
-"""One half has nearly all of such a pixel: a single sample was so bright."""
+_SHAPE_OF_ONE_SAMPLE = 0.05
+"""One half has all of such a pixel: a single sample was so bright."""
 
 _STRAY = 8 / 3
 """Emission of more than so many times the mean of the 8 pixels around was hit by chance: a lamp's corner has
@@ -114,8 +115,8 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
 
     def beta(level: _Plane, noise: _Plane, least: FloatArray | float) -> FloatArray:
         shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
-        values: FloatArray = drawn.beta(shape / 2, shape / 2).astype(np.float32)
-        return values
+        values = drawn.beta(shape / 2, shape / 2)
+        return np.where(shape < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
 
     share = np.repeat(
         beta(level.sum(axis=2), noise.sum(axis=2), _LEAST_SHAPE_OF_LAMPS * lit)[:, :, None], 3, 2
