@@ -1,7 +1,8 @@
 """The one exception for what a user can fix: bad files, bad scenes, bad settings."""
 
+import math
 from collections.abc import Collection
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -29,6 +30,20 @@ def whole_number(what: str, value: Any, least: int, most: int) -> int:
     if not (isinstance(value, Integral) and least <= int(value) <= most):
         raise InputError(f"{what}: expected a whole number from {least} to {most}, got {_shown(value)}")
     return int(value)
+
+
+def positive_number(what: str, value: Any) -> float:
+    """Return a number, perhaps of numpy's, as Python's own.
+
+    Raises InputError if it is none, is not above 0, or is too large for a float.
+    """
+    try:
+        number = float(value) if isinstance(value, Real) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not 0 < number < math.inf:
+        raise InputError(f"{what}: expected a finite number above 0, got {_shown(value)}")
+    return number
 
 
 def _shown(value: Any) -> str:

@@ -203,6 +203,7 @@ def test_what_no_renderer_can_mean_stays_out(value: float, halves: bool, make_re
         broken[name] = Buffer(**planes)
     result = denoise(buffers.with_quantities(**broken), _settings(iterations=5))
     check_result(result, buffers)
+    assert result.color.max() < 2 * denoise(buffers, _settings(iterations=5)).color.max()
 
 
 @pytest.mark.parametrize("value", [1e12, 1e30, 3e38])
@@ -285,6 +286,8 @@ def test_candidates_without_halves_are_noted(render: SyntheticRender) -> None:
     [
         ([(np.zeros((40, 56, 3)), np.zeros((56, 40, 3)))], "candidate 0, half B: expected shape"),
         ([(np.zeros((40, 56, 3)),)], "candidate 0: expected a pair"),
+        ([None], "candidate 0: expected a pair"),
+        (np.float32(5), "candidates: expected Sequence"),
         ([(np.full((40, 56, 3), np.nan), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
         ([(np.full((40, 56, 3), 1e300), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
     ],
@@ -589,6 +592,8 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
         {"iterations": -3},
         {"time_budget_s": 0.0},
         {"time_budget_s": float("nan")},
+        {"time_budget_s": float("inf")},
+        {"target_error": 10**400},
         {"target_error": -1.0},
         {"threads": 0},
         {"channels": ()},

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 
 import numpy as np
 
 from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers, check_array
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, check_type
 
 
 def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> tuple[Halves, ...]:
@@ -15,6 +15,7 @@ def checked_candidates(buffers: RenderBuffers, candidates: Sequence[Halves]) -> 
 
     Raises InputError if one is not a pair of images of the colour's shape, or holds NaN or Inf.
     """
+    check_type("candidates", candidates, Sequence, "give a list of pairs of images")
     checked = []
     for index, pair in enumerate(candidates):
         checked.append(_checked_pair(f"candidate {index}", pair, buffers))
@@ -35,8 +36,9 @@ def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves 
 
 
 def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
-    if len(pair) != 2:
-        raise InputError(f"{what}: expected a pair of images, one per half, got {len(pair)}")
+    if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
+        got = len(pair) if isinstance(pair, Sized) else type(pair).__name__
+        raise InputError(f"{what}: expected a pair of images, one per half, got {got}")
     expected = buffers.color.mean.shape
     for name, image in zip("AB", pair, strict=True):
         check_array(f"{what}, half {name}", image)

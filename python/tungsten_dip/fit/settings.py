@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from tungsten_dip.errors import InputError, check_choice, whole_number
+from tungsten_dip.errors import InputError, check_choice, positive_number, whole_number
 
 Preset = Literal["draft", "balanced", "final", "paper"]
 Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
@@ -63,11 +62,8 @@ class FitSettings:
                 object.__setattr__(self, name, whole_number(name, value, least, most))
         for name in ("time_budget_s", "target_error"):
             value = getattr(self, name)
-            if value is None:
-                continue
-            if not (isinstance(value, Real) and float(value) > 0):
-                raise InputError(f"{name}: expected a number above 0, got {value!r:.40}")
-            object.__setattr__(self, name, float(value))
+            if value is not None:
+                object.__setattr__(self, name, positive_number(name, value))
         counts = self.channels
         if not isinstance(counts, tuple) or not 0 < len(counts) <= _MOST_SCALES:
             raise InputError(
