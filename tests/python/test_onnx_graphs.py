@@ -83,16 +83,16 @@ def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, in
     rng = np.random.default_rng(0)
     height, width = size
     inputs = rng.normal(0, 2, (2, len(model.inputs), height, width)).astype(np.float32)
-    pilots = rng.random((2, model.layout.choices, 3, height, width), np.float32)
-    color = session_of(model).run(None, {"inputs": inputs, "pilots": pilots})[0]
+    choices = rng.random((2, model.layout.choice_count, 3, height, width), np.float32)
+    color = session_of(model).run(None, {"inputs": inputs, "choices": choices})[0]
     assert color.shape == (2, 3, height, width)
 
     flat = inputs.reshape(2, len(model.inputs), -1).transpose(0, 2, 1).copy()
     model.standardisation.apply(flat, threads=1)
-    choices = pilots.reshape(2, model.layout.choices, 3, -1).transpose(0, 3, 1, 2).copy()
+    flat_choices = choices.reshape(2, model.layout.choice_count, 3, -1).transpose(0, 3, 1, 2).copy()
     network = TorchNetwork(model.weights)
     for half in (0, 1):
-        examples = Examples(flat[half], choices[half], choices[half, :, 0], flat[half, :, :1])
+        examples = Examples(flat[half], flat_choices[half], flat_choices[half, :, 0], flat[half, :, :1])
         expected = network.fuse(examples).T.reshape(3, height, width)
         np.testing.assert_allclose(color[half], expected, rtol=1e-4)
 
@@ -161,15 +161,15 @@ def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> N
     weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
     fit = Model("pointwise", layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
-    pilots = rng.random((2, 2, 3, 6, 7), np.float32)
-    color = session_of(fit).run(None, {"inputs": raw, "pilots": pilots})[0]
+    choices = rng.random((2, 2, 3, 6, 7), np.float32)
+    color = session_of(fit).run(None, {"inputs": raw, "choices": choices})[0]
     standardisation.apply(flat, threads=1)
     x = flat.astype(np.float64)
     for layer in (1, 2, 3):
         x = x @ weights[f"layer{layer}.weight"][:, :, 0, 0].T + weights[f"layer{layer}.bias"]
         x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
     shares = np.exp(x) / np.exp(x).sum(2, keepdims=True)
-    expected = np.einsum("hps,hscp->hcp", shares, pilots.reshape(2, 2, 3, -1))
+    expected = np.einsum("hps,hscp->hcp", shares, choices.reshape(2, 2, 3, -1))
     np.testing.assert_allclose(color.reshape(2, 3, -1), expected, rtol=1e-5)
 
 

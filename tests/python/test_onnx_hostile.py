@@ -171,7 +171,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (many_nodes, "too many parts"),
     (long_name, "beside the weights"),
     (no_metadata, "tungsten-dip wrote"),
-    (metadata('"format": 4', '"format": 1'), "expected format 4, found 1"),
+    (metadata('"format": 5', '"format": 1'), "expected format 5, found 1"),
     (metadata('"kind": "pointwise"', '"kind": "skip"'), "kind|network"),
     (metadata('"candidates": 0', '"candidates": 1000000000000'), "inputs|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
@@ -191,7 +191,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (whole_metadata("[" * 100_000), "JSON"),
     (whole_metadata("{"), "JSON"),
     (whole_metadata("[]"), "format"),
-    (whole_metadata('{"format": 4}'), "kind"),
+    (whole_metadata('{"format": 5}'), "kind"),
 ]
 
 

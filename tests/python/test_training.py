@@ -21,17 +21,17 @@ def test_the_pixels_that_tell_the_error_are_not_trained_on(
     render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     probed, trained = [], []
-    pilots_at, batches = Evidence.pilots_at, training._batches
+    choices_at, batches = Evidence.choices_at, training._batches
 
     def probed_at(evidence: Evidence, pixels: Indices) -> Any:
         probed.append(pixels)
-        return pilots_at(evidence, pixels)
+        return choices_at(evidence, pixels)
 
     def batches_of(examples: Examples, pixels: Indices, *rest: Any) -> Iterator[Examples]:
         trained.append(pixels)
         return batches(examples, pixels, *rest)
 
-    monkeypatch.setattr(Evidence, "pilots_at", probed_at)
+    monkeypatch.setattr(Evidence, "choices_at", probed_at)
     monkeypatch.setattr(training, "_batches", batches_of)
     denoise(render.buffers, FitSettings("draft", iterations=1, threads=1))
     assert len(probed) == len(trained) == 1

@@ -40,13 +40,13 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     batch = examples.at(rng.integers(2 * 480, size=pixels))
 
     in_torch = TorchNetwork(weights)
-    in_onnx = PointwiseNetwork(weights, len(layout.inputs), layout.choices, "cpu")
-    proto = training_step(len(layout.inputs), layout.choices)
+    in_onnx = PointwiseNetwork(weights, len(layout.inputs), layout.choice_count, "cpu")
+    proto = training_step(len(layout.inputs), layout.choice_count)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
     feeds = {
         "inputs": batch.inputs,
-        "pilots": batch.pilots,
+        "choices": batch.choices,
         "target": batch.target,
         "weight": batch.weight,
         "weights": vector,
@@ -72,7 +72,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
 def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
-    sizes = len(layout.inputs), layout.choices
+    sizes = len(layout.inputs), layout.choice_count
     together = PointwiseNetwork(weights, *sizes, "cpu", threads=2)
     parts = {name: np.split(value, 3) for name, value in weights.items()}
     alone = [
@@ -96,7 +96,7 @@ def test_gradients_are_those_of_the_loss() -> None:
     vector = rng.normal(0, 0.5, sum(int(np.prod(s)) for s in shapes.values()))
     feeds = {
         "inputs": rng.normal(size=(pixels, inputs)),
-        "pilots": rng.random((pixels, choices, 3)),
+        "choices": rng.random((pixels, choices, 3)),
         "target": rng.random((pixels, 3)),
         "weight": rng.random((pixels, 1)),
     }
@@ -112,7 +112,7 @@ def test_gradients_are_those_of_the_loss() -> None:
             x = x @ parts[0].T + parts[1]
             x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
         shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
-        fused = (shares[:, :, None] * feeds["pilots"]).sum(1)
+        fused = (shares[:, :, None] * feeds["choices"]).sum(1)
         return float(np.mean(feeds["weight"] * (fused - feeds["target"]) ** 2))
 
     expected = [(loss(vector + d) - loss(vector - d)) / 2e-6 for d in 1e-6 * np.eye(vector.size)]
@@ -153,7 +153,7 @@ def test_the_network_sees_the_noise_of_no_pixel_at_that_pixel(changed: str, fram
     y, x, half = 11, 17, 0
     noisy = [image.copy() for image in evidence.halves]
     noisy[half if changed == "seen" else 1 - half][y, x] *= 3
-    other = replace(evidence, pilots=((noisy[0], noisy[1]), *evidence.pilots[1:]))
+    other = replace(evidence, choices=((noisy[0], noisy[1]), *evidence.choices[1:]))
     before, after = (np.stack(list(inputs_of_half(e, half)), axis=2) for e in (evidence, other))
     np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
     assert np.abs(after - before).max() > 0.01

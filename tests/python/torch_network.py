@@ -48,4 +48,4 @@ class TorchNetwork:
             x = x @ weight.T + bias
             if layer < 3:
                 x = nn.functional.leaky_relu(x, LEAKY_SLOPE)
-        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.pilots)).sum(1)
+        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.choices)).sum(1)

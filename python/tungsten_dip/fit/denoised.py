@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tungsten_dip import _core
@@ -13,7 +11,7 @@ from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, 
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.error import epsilon_of_renderer, error_from_halves, estimate_error, relative_error
+from tungsten_dip.fit.error import bounded_ratio, epsilon_of_renderer, error_from_halves, estimate_error
 from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.exposure import exposure, unscaled
 from tungsten_dip.fit.lost_detail import with_lost_detail
@@ -45,7 +43,7 @@ def result_without_noise(
     if max(estimated) >= _CONVERGED or estimated == [0]:
         return None
     progress(1.0, "no noise")
-    error = channel_mean(relative_error(noise, squared + RELMSE_EPSILON).astype(np.float32))
+    error = channel_mean(bounded_ratio(noise, squared + RELMSE_EPSILON).astype(np.float32))
     return FitResult(
         color=color.mean.copy(),
         settings=settings,
@@ -58,22 +56,17 @@ def result_without_noise(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Denoised:
-    """The images of a result and what is known of them; the fields are those of `FitResult`."""
-
-    color: FloatImage
-    error: FloatImage
-    estimated_relmse: float
-    halves: Halves
-    gain: FloatImage | None
-    notes: tuple[str, ...]
-
-
-def denoised_image(evidence: Evidence, fused: Halves, all_samples_blend: FloatImage | None) -> Denoised:
+def denoised_image(
+    evidence: Evidence,
+    fused: Halves,
+    all_samples_blend: FloatImage | None,
+    settings: FitSettings,
+    clock: Clock,
+) -> FitResult:
     """Make the image from the network's outputs for both halves, or from the input if that is as good.
 
-    ``all_samples_blend`` are the pilots of all samples, blended with the mean of both halves' weights.
+    ``all_samples_blend`` are the pilots of all samples, blended with the mean of both halves' weights. The
+    result is that of a network without training (``iterations`` 0), and without its ``model``.
     """
     threads = evidence.threads
     fused = with_lost_detail(evidence.halves, fused)
@@ -81,26 +74,30 @@ def denoised_image(evidence: Evidence, fused: Halves, all_samples_blend: FloatIm
     if all_samples_blend is not None:
         image = with_all_samples(fused, all_samples_blend, threads)
     pixels = fused[0].reshape(-1, 3), fused[1].reshape(-1, 3)
-    error = estimate_error(evidence.pilots, evidence.scale, pixels).reshape(*image.shape[:2], 1)
+    error = estimate_error(evidence.choices, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
     squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
     error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
     estimated, _ = error_from_halves(evidence.halves, pixels, np.float32(RELMSE_EPSILON))
-    notes: tuple[str, ...] = ()
+    notes = evidence.notes
     if estimated >= error_of_input:
-        notes = ("the input is as good as anything fitted to it, and is returned",)
+        notes = (*notes, "the input is as good as anything fitted to it, and is returned")
         image, fused = evidence.mean, evidence.halves
         epsilon = epsilon_of_renderer(evidence.scale)
-        error = relative_error(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
+        error = bounded_ratio(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
     if evidence.gain is not None:
         image = image * evidence.gain
-    return Denoised(
+    return FitResult(
         color=unscaled(image, evidence.scale),
+        settings=settings,
+        seconds=clock.seconds(),
+        iterations=0,
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),
         halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
         gain=evidence.gain,
+        halves_drawn=evidence.halves_drawn,
         notes=notes,
     )

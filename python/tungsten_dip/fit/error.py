@@ -28,10 +28,10 @@ _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
-def estimate_error(pilots: Sequence[Halves], scale: float, fused: Halves) -> FloatArray:
+def estimate_error(choices: Sequence[Halves], scale: float, fused: Halves) -> FloatArray:
     """Estimate the squared error of the mean f of both outputs in each pixel, relative to f^2 + 0.01.
 
-    ``pilots`` and ``scale`` are the evidence's, ``fused`` the outputs f_a and f_b for one half each, shape
+    ``choices`` and ``scale`` are the evidence's, ``fused`` the outputs f_a and f_b for one half each, shape
     (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
     (f_a - f_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
     they differ from f where there is something to blur; but some are far off where the network rightly
@@ -44,7 +44,7 @@ def estimate_error(pilots: Sequence[Halves], scale: float, fused: Halves) -> Flo
     squared = (fused[0] - fused[1]) ** 2 / 4
     variance = np.empty(len(output), np.float32)
     bias = np.empty(len(output), np.float32)
-    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in pilots[1:]]
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in choices[1:]]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
         relative = 1 / (output[part] ** 2 + epsilon)
@@ -57,13 +57,13 @@ def estimate_error(pilots: Sequence[Halves], scale: float, fused: Halves) -> Flo
             apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
         # The root of each: their product would overflow.
         bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
-    estimated, standard_error = error_from_halves(pilots[0], fused, epsilon)
+    estimated, standard_error = error_from_halves(choices[0], fused, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
-def held_out_error(pilots: Sequence[Halves], fused: Halves) -> float:
+def held_out_error(choices: Sequence[Halves], fused: Halves) -> float:
     """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
@@ -71,7 +71,7 @@ def held_out_error(pilots: Sequence[Halves], fused: Halves) -> float:
     pilot, far less noisy but a little blurred.
     """
     epsilon = np.float32(RELMSE_EPSILON)
-    for targets in pilots[:2]:
+    for targets in choices[:2]:
         mean, standard_error = error_from_halves(targets, fused, epsilon)
         if is_sure(mean, standard_error):
             break
@@ -84,7 +84,7 @@ def error_from_halves(targets: Halves, fused: Halves, epsilon: np.float32) -> tu
     noisy_a, noisy_b = (image.reshape(-1, 3) for image in targets)
     of_one, variance = crossed_errors((noisy_a, noisy_b), fused)
     denominator = mean_of(fused) ** 2 + epsilon
-    return mean_and_standard_error(channel_mean(relative_error(of_one - variance, denominator)))
+    return mean_and_standard_error(channel_mean(bounded_ratio(of_one - variance, denominator)))
 
 
 def crossed_errors(noisy: Halves, fused: Halves) -> tuple[FloatArray, FloatArray]:
@@ -116,7 +116,7 @@ def is_sure(mean: float, standard_error: float) -> bool:
     return standard_error < _SURE * mean
 
 
-def relative_error(
+def bounded_ratio(
     squared: npt.NDArray[np.floating[Any]], denominator: npt.NDArray[np.floating[Any]]
 ) -> npt.NDArray[Any]:
     """Return squared errors relative to a denominator, bounded so that they can be summed."""

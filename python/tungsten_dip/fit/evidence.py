@@ -58,36 +58,38 @@ class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
-    (height, width). ``pilots`` holds both halves of the noisy image, of every pilot, of every candidate.
-    ``noises`` is the relative squared difference, shape (height, width, 1), of the reference pilot and the
+    (height, width). ``choices`` holds both halves of the noisy image, of every pilot, of every candidate.
+    ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and the
     other half, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`).
+    ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
 
     scale: float
     mean: FloatImage
     features: tuple[dict[str, FloatImage], ...]
     layout: Layout
-    pilots: tuple[Halves, ...]
+    choices: tuple[Halves, ...]
     noises: Halves
     guide_noise: FloatImage
     gain: FloatImage | None
+    halves_drawn: bool
     notes: tuple[str, ...]
     threads: int
 
     @property
     def halves(self) -> Halves:
         """The noisy halves."""
-        return self.pilots[0]
+        return self.choices[0]
 
     @property
     def denominators(self) -> Halves:
         """What squared errors are relative to, per half, shape (height, width, 1)."""
-        return _denominators(self.pilots[self.layout.denominator])
+        return _denominators(self.choices[self.layout.denominator])
 
-    def pilots_at(self, pixels: Indices) -> tuple[Halves, ...]:
-        """Return the pilots at some pixels, shape (pixels, 3)."""
-        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.pilots)
+    def choices_at(self, pixels: Indices) -> tuple[Halves, ...]:
+        """Return the choices at some pixels, shape (pixels, 3)."""
+        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.choices)
 
     def rows(self, first: int, end: int) -> Evidence:
         """Return the evidence of some rows alone."""
@@ -101,7 +103,7 @@ class Evidence:
             features=tuple(
                 {name: image[first:end] for name, image in features.items()} for features in self.features
             ),
-            pilots=tuple(cut(pilot) for pilot in self.pilots),
+            choices=tuple(cut(choice) for choice in self.choices),
             noises=cut(self.noises),
             guide_noise=self.guide_noise[first:end],
             gain=None if self.gain is None else self.gain[first:end],
@@ -148,17 +150,27 @@ def evidence_from_buffers(
     if filled is not None:
         candidates.append(filled)
 
-    images = (halves, *computed, *candidates)
+    choices = (halves, *computed, *candidates)
     denominators = _denominators(computed[-1])
     if layout is None:
-        reference = _best(images, denominators)
-        layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), reference)
-    noises = _noises(_errors(images[layout.reference], halves, denominators), threads)
+        baseline = _best(choices, denominators)
+        layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), baseline)
+    noises = _noises(_errors(choices[layout.baseline], halves, denominators), threads)
     features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
-    notes = _notes_on_features(buffers)
-    if limited.note is not None:
-        notes = (*notes, limited.note)
-    return Evidence(scale, mean, features, layout, images, noises, guides.noise, limited.gain, notes, threads)
+    notes = (*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes)
+    return Evidence(
+        scale=scale,
+        mean=mean,
+        features=features,
+        layout=layout,
+        choices=choices,
+        noises=noises,
+        guide_noise=guides.noise,
+        gain=limited.gain,
+        halves_drawn=image.drawn,
+        notes=notes,
+        threads=threads,
+    )
 
 
 def _guides(
@@ -224,8 +236,8 @@ def pilots_of_all_samples(
 ) -> tuple[FloatImage, ...]:
     """Return the pilots of all samples, with less noisy features and guides than a half's.
 
-    One image for each of ``evidence.pilots``, in the units of the evidence, shape (height, width, 3). None at
-    all where the pilots of the halves have used up their share of the time budget, or once ``given_up`` is
+    One image for each of ``evidence.choices``, in the units of the evidence, shape (height, width, 3). None
+    at all where the pilots of the halves have used up their share of the time budget, or once ``given_up`` is
     set.
     """
     if clock.share_spent() > _PILOTS_SHARE:
@@ -244,35 +256,35 @@ def pilots_of_all_samples(
         if given_up is not None and given_up.is_set():
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
-    candidates = [mean_of(candidate) for candidate in evidence.pilots[1 + len(pilots) :]]
+    candidates = [mean_of(candidate) for candidate in evidence.choices[1 + len(pilots) :]]
     if settings.pilot == "oidn":
         (candidates[-1],) = oidn_pilot(buffers, colors, evidence.scale, evidence.threads)
     return (evidence.mean, *computed, *candidates)
 
 
-def with_best_reference(evidence: Evidence) -> Evidence:
-    """Return the same evidence with the pilot that is best on this image as the reference."""
-    pilots, denominators = evidence.pilots, evidence.denominators
-    reference = _best(pilots, denominators)
-    noises = _noises(_errors(pilots[reference], evidence.halves, denominators), evidence.threads)
-    return replace(evidence, layout=replace(evidence.layout, reference=reference), noises=noises)
+def with_best_baseline(evidence: Evidence) -> Evidence:
+    """Return the same evidence with the pilot that is best on this image as the baseline."""
+    choices, denominators = evidence.choices, evidence.denominators
+    baseline = _best(choices, denominators)
+    noises = _noises(_errors(choices[baseline], evidence.halves, denominators), evidence.threads)
+    return replace(evidence, layout=replace(evidence.layout, baseline=baseline), noises=noises)
 
 
-def _best(images: Sequence[Halves], denominators: Halves) -> int:
-    """Return the index of the best pilot; ``images`` are the noisy halves, then the pilots."""
+def _best(choices: Sequence[Halves], denominators: Halves) -> int:
+    """Return the index of the best but for the noisy halves, the first."""
     mean_errors = [
-        sum(float(np.minimum(error, 1).mean()) for error in _errors(image, images[0], denominators))
-        for image in images[1:]
+        sum(float(np.minimum(error, 1).mean()) for error in _errors(choice, choices[0], denominators))
+        for choice in choices[1:]
     ]
     return 1 + int(np.argmin(mean_errors))
 
 
-def _noises(errors_of_reference: Halves, threads: int) -> Halves:
+def _noises(errors_of_baseline: Halves, threads: int) -> Halves:
     """Return `Evidence.noises`."""
     a, b = (
         # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
         np.maximum(mean_around(_capped(error, threads), _NOISE_RADIUS, threads), 0)
-        for error in errors_of_reference
+        for error in errors_of_baseline
     )
     return a, b
 
@@ -333,11 +345,11 @@ def _denominators(pilot: Halves) -> Halves:
 
 def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
     """How well each half's pilot predicts the other half."""
-    a, b = (squared_error(*images) for images in zip(pilot, halves[::-1], denominators, strict=True))
+    a, b = (relative_error(*images) for images in zip(pilot, halves[::-1], denominators, strict=True))
     return a, b
 
 
-def squared_error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
+def relative_error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
     """Return the mean over the channels, relative to a denominator of shape (height, width, 1)."""
     error: FloatImage = channel_mean((image - other) ** 2) / denominator
     return error

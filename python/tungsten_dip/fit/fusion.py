@@ -93,38 +93,31 @@ def fit_fusion(
     network = PointwiseNetwork(
         start.weights,
         len(evidence.layout.inputs),
-        evidence.layout.choices,
+        evidence.layout.choice_count,
         settings.device,
         evidence.threads,
     )
     training, all_samples_pilots = _trained(network, start, halved.buffers, settings, preset, clock, progress)
     fused, all_samples_blend = _fused(network, start, all_samples_pilots)
-    image = denoised_image(evidence, fused, all_samples_blend)
+    result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
     if not training.interrupted:
-        progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
-    return FitResult(
-        color=image.color,
-        settings=settings,
-        seconds=clock.seconds(),
+        progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
+    return replace(
+        result,
         iterations=training.steps_done,
-        error=image.error,
-        estimated_relmse=image.estimated_relmse,
-        halves=image.halves,
-        gain=image.gain,
-        halves_drawn=halved.drawn,
         model=Model(
             kind="pointwise",
             inputs=evidence.layout.inputs,
             weights=network.weights(),
             settings=settings,
-            estimated_relmse=image.estimated_relmse,
+            estimated_relmse=result.estimated_relmse,
             source_sha256=source_sha256(buffers),
             layout=evidence.layout,
             standardisation=start.standardisation,
         ),
         history=tuple(training.history),
         interrupted=training.interrupted,
-        notes=(*evidence.notes, *halved.notes, *training.notes, *image.notes),
+        notes=(*result.notes, *training.notes),
     )
 
 

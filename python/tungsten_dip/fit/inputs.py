@@ -18,7 +18,7 @@ from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import (
     OUTLIER,
     Evidence,
-    squared_error,
+    relative_error,
 )
 from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around
@@ -37,10 +37,10 @@ _LEAST_CAP = 1e-3
 """Errors up to here are never capped as outliers."""
 
 _LARGEST_BRIGHTNESS = 2.0
-"""Pilots more than e^2 times brighter than the reference, or darker, are as far off."""
+"""Pilots more than e^2 times brighter than the baseline, or darker, are as far off."""
 
 _SCORE_UNIT = 0.05
-"""A pilot that is worse than the reference by this part of the noise scores 1, ..."""
+"""A pilot that is worse than the baseline by this part of the noise scores 1, ..."""
 
 _LARGEST_SCORE = 3.0
 """... and this is the worst score."""
@@ -74,23 +74,23 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
         yield evidence.features[half][name]
     noise = evidence.noises[half]
     yield np.log(noise + np.float32(_LEAST_ERROR))[:, :, 0]
-    base = _log_level(evidence.pilots[layout.reference][half])
+    base = _log_level(evidence.choices[layout.baseline][half])
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
     denominator = evidence.denominators[half]
     unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
     cap = np.float32(OUTLIER) * noise + np.float32(_LEAST_CAP)
-    reference = np.minimum(squared_error(evidence.pilots[layout.reference][half], other, denominator), cap)
-    for index, pilot in enumerate(evidence.pilots):
-        if index == layout.reference:
+    baseline = np.minimum(relative_error(evidence.choices[layout.baseline][half], other, denominator), cap)
+    for index, choice in enumerate(evidence.choices):
+        if index == layout.baseline:
             continue
-        image = pilot[half]
+        image = choice[half]
         if index == 0:
             # Without the pixel's own noise: else a noisy pixel is chosen for being dark by chance.
             image = np.maximum(mean_around(image, 1, threads), 0)
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
-        worse = np.minimum(squared_error(pilot[half], other, denominator), cap) - reference
+        worse = np.minimum(relative_error(choice[half], other, denominator), cap) - baseline
         for radius in SCORE_RADII:
             score = mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]

@@ -33,16 +33,16 @@ class Layout:
 
     ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
     filters compute, then the candidates: the caller's, Open Image Denoise's, the previous frame.
-    ``reference`` is the index of the pilot that the others are compared with.
+    ``baseline`` is the index of the pilot that the others are compared with.
     """
 
     features: tuple[str, ...]
     pilots: tuple[Pilot, ...]
     candidate_count: int
-    reference: int
+    baseline: int
 
     @property
-    def choices(self) -> int:
+    def choice_count(self) -> int:
         """How many images the network chooses among."""
         return 1 + len(self.pilots) + self.candidate_count
 
@@ -60,8 +60,8 @@ class Layout:
             "level",
             *(
                 f"pilot {index} {what}"
-                for index in range(self.choices)
-                if index != self.reference
+                for index in range(self.choice_count)
+                if index != self.baseline
                 for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
             ),
         )

@@ -41,12 +41,12 @@ _RUN_PIXELS = 1 << 14
 class Examples:
     """What a network is trained on: pixels of an image, those of half A first, or some of them.
 
-    ``inputs`` has shape (pixels, inputs), ``pilots`` (pixels, pilots, 3), ``target``, the other half's
+    ``inputs`` has shape (pixels, inputs), ``choices`` (pixels, choices, 3), ``target``, the other half's
     colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
     inputs: FloatArray
-    pilots: FloatArray
+    choices: FloatArray
     target: FloatArray
     weight: FloatArray
 
@@ -64,16 +64,16 @@ class Examples:
         return self.part(half * pixels, (half + 1) * pixels)
 
     def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.inputs, self.pilots, self.target, self.weight
+        return self.inputs, self.choices, self.target, self.weight
 
 
 def training_step(inputs: int, choices: int) -> onnx.ModelProto:
     """Return the graph of one step.
 
-    Inputs: ``inputs`` (M, inputs), standardised, ``pilots`` (M, pilots, 3), ``target`` (M, 3) and ``weight``
-    (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square``
-    (Adam's moments) and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs:
-    ``loss``, the vector ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
+    Inputs: ``inputs`` (M, inputs), standardised, ``choices`` (M, choices, 3), ``target`` (M, 3) and
+    ``weight`` (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square`` (Adam's moments)
+    and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs: ``loss``, the vector
+    ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
     """
     build = _Step()
     shapes = weight_shapes(inputs, choices)
@@ -82,7 +82,7 @@ def training_step(inputs: int, choices: int) -> onnx.ModelProto:
     build.adam(gradient)
     pixels: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", inputs),
-        "pilots": ("M", choices, 3),
+        "choices": ("M", choices, 3),
         "target": ("M", 3),
         "weight": ("M", 1),
     }
@@ -106,7 +106,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
     """Return the weights that untrained members start from (He et al. 2015, uniform)."""
     rng = np.random.default_rng(seed)
     weights: Weights = {}
-    for name, (outputs, *inputs) in weight_shapes(len(layout.inputs), layout.choices).items():
+    for name, (outputs, *inputs) in weight_shapes(len(layout.inputs), layout.choice_count).items():
         if inputs:
             bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs[0]))
             shape = (members * outputs, *inputs, 1, 1)
@@ -115,7 +115,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
             weights[name] = np.zeros(members * outputs, np.float32)
     # Starts from the mean of the pilots that the head start gives, whatever the seed.
     weights["layer3.weight"][:] = 0
-    weights["layer3.bias"][layout.reference :: layout.choices] = _HEAD_START
+    weights["layer3.bias"][layout.baseline :: layout.choice_count] = _HEAD_START
     return weights
 
 
@@ -140,7 +140,7 @@ class PointwiseNetwork:
         self._steps_done += 1
         feeds = {
             "inputs": batch.inputs,
-            "pilots": batch.pilots,
+            "choices": batch.choices,
             "target": batch.target,
             "weight": batch.weight,
             "learning_rate": np.array([learning_rate], np.float32),
@@ -154,7 +154,7 @@ class PointwiseNetwork:
         self._members = in_parallel(stepped, self._members, self._threads)
 
     def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> FloatArray:
-        """Return the weighted mean of the pilots or, by the same weights, of ``images``; shape (pixels, 3).
+        """Return the weighted mean of the choices or, by the same weights, of ``images``; shape (pixels, 3).
 
         Raises InputError if it is not finite.
         """
@@ -164,7 +164,7 @@ class PointwiseNetwork:
             part = slice(first, first + _RUN_PIXELS)
             feeds = {
                 "inputs": examples.inputs[part],
-                "pilots": np.stack([image[part] for image in flat], 1) if flat else examples.pilots[part],
+                "choices": np.stack([image[part] for image in flat], 1) if flat else examples.choices[part],
             }
             by_members = (
                 self._fuse.run(["fused"], {**feeds, "weights": member["weights"]})[0]
@@ -213,7 +213,7 @@ def _forward(inputs: int, choices: int) -> onnx.ModelProto:
     build.add("Transpose", build.forward(shapes)["mixed"], perm=[1, 0], output="fused")
     given: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", inputs),
-        "pilots": ("M", choices, 3),
+        "choices": ("M", choices, 3),
         "weights": (sum(int(np.prod(shape)) for shape in shapes.values()),),
     }
     return build.model("forward", given, {"fused": ("M", 3)})
@@ -223,7 +223,7 @@ class _Step(GraphBuilder):
     """The parts of a step; columns of matrices are pixels, as long rows are what a processor is fast at."""
 
     def forward(self, shapes: dict[str, tuple[int, ...]]) -> dict[str, str]:
-        """Compute the pilots' weighted means, ``mixed`` (3, M); return them, and what the gradients need."""
+        """Compute the choices' weighted means, ``mixed`` (3, M); return them, and what the gradients need."""
         sizes = [int(np.prod(shape)) for shape in shapes.values()]
         known: dict[str, str] = {}
         for (name, shape), part in zip(shapes.items(), self.split("weights", sizes), strict=True):
@@ -241,9 +241,10 @@ class _Step(GraphBuilder):
         exp = self.add("Exp", self.add("Sub", x, self.add("ReduceMax", x, self.integers(0))))
         known["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
         count = shapes["layer3.bias"][0]
-        flat = self.add("Transpose", self.add("Reshape", "pilots", self.integers(-1, 3 * count)), perm=[1, 0])
-        known["pilots"] = self.add("Reshape", flat, self.integers(count, 3, -1))
-        shared = self.add("Mul", known["pilots"], self.add("Unsqueeze", known["shares"], self.integers(1)))
+        in_rows = self.add("Reshape", "choices", self.integers(-1, 3 * count))
+        flat = self.add("Transpose", in_rows, perm=[1, 0])
+        known["choices"] = self.add("Reshape", flat, self.integers(count, 3, -1))
+        shared = self.add("Mul", known["choices"], self.add("Unsqueeze", known["shares"], self.integers(1)))
         known["mixed"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
         return known
 
@@ -259,7 +260,7 @@ class _Step(GraphBuilder):
         count = self.add("Cast", self.add("Size", "target"), to=onnx.TensorProto.FLOAT)
         by_mixed = self.add("Mul", weighted, self.add("Div", self.number(2), count))
         by_share = self.add(
-            "ReduceSum", self.add("Mul", known["pilots"], by_mixed), self.integers(1), keepdims=0
+            "ReduceSum", self.add("Mul", known["choices"], by_mixed), self.integers(1), keepdims=0
         )
         # softmax: share * (derivative - mean of the derivatives by shares)
         mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(0))

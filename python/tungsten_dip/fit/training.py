@@ -12,7 +12,7 @@ from tungsten_dip.buffers.render_buffers import FloatArray, Halves, Indices
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error
-from tungsten_dip.fit.evidence import Evidence, with_best_reference
+from tungsten_dip.fit.evidence import Evidence, with_best_baseline
 from tungsten_dip.fit.inputs import (
     loss_weights,
     network_inputs,
@@ -80,7 +80,7 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None, member
         if max(far_out) <= _STRANGE:
             return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
         notes = ("the image is too unlike the model's: a new network is fitted",)
-        evidence = with_best_reference(evidence)
+        evidence = with_best_baseline(evidence)
         inputs = network_inputs(evidence)
     standardisation = standardisation_of(inputs, evidence.threads)
     standardisation.apply(inputs, evidence.threads)
@@ -98,20 +98,20 @@ def _start(
 ) -> Start:
     """Return the start with its examples; its evidence holds no second copy of what they hold."""
     pixels = inputs.shape[1]
-    pilots = np.empty((2, pixels, len(evidence.pilots), 3), np.float32)
+    choices = np.empty((2, pixels, len(evidence.choices), 3), np.float32)
 
     def fill(half: int) -> None:
-        for index, pilot in enumerate(evidence.pilots):
-            pilots[half, :, index] = pilot[half].reshape(pixels, 3)
+        for index, choice in enumerate(evidence.choices):
+            choices[half, :, index] = choice[half].reshape(pixels, 3)
 
     in_pair(fill, evidence.threads)
     target = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
     # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
-    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in pilots.transpose(2, 0, 1, 3))
-    examples = Examples(inputs.reshape(2 * pixels, -1), pilots.reshape(2 * pixels, -1, 3), target, weight)
-    evidence = replace(evidence, pilots=views, features=({}, {}))
+    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
+    examples = Examples(inputs.reshape(2 * pixels, -1), choices.reshape(2 * pixels, -1, 3), target, weight)
+    evidence = replace(evidence, choices=views, features=({}, {}))
     return Start(evidence, examples, standardisation, weights, warm, notes)
 
 
@@ -133,9 +133,9 @@ def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Gen
 
 @dataclass(frozen=True)
 class _Probe:
-    """Pixels by which a training is judged: their pilots, and the examples of each half."""
+    """Pixels by which a training is judged: what is chosen among there, and the examples of each half."""
 
-    pilots: tuple[Halves, ...]
+    choices: tuple[Halves, ...]
     examples: tuple[Examples, Examples]
     scale: float
     threads: int
@@ -143,8 +143,8 @@ class _Probe:
     def errors(self, network: PointwiseNetwork) -> tuple[float, float]:
         """Return the estimated error, and the error on the other half."""
         fused = in_pair(lambda half: network.fuse(self.examples[half]), self.threads)
-        errors = estimate_error(self.pilots, self.scale, fused)
-        return float(errors.mean(dtype=np.float64)), held_out_error(self.pilots, fused)
+        errors = estimate_error(self.choices, self.scale, fused)
+        return float(errors.mean(dtype=np.float64)), held_out_error(self.choices, fused)
 
 
 def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
@@ -155,7 +155,7 @@ def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
     probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
     evidence, examples = start.evidence, start.examples
     of_halves = examples.of_half(0).at(probe), examples.of_half(1).at(probe)
-    return _Probe(evidence.pilots_at(probe), of_halves, evidence.scale, evidence.threads), trained
+    return _Probe(evidence.choices_at(probe), of_halves, evidence.scale, evidence.threads), trained
 
 
 @dataclass

@@ -33,7 +33,7 @@ LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
 """Of all but the weights: bounds the memory of the parser."""
 
-_FORMAT = 4
+_FORMAT = 5
 """Raised whenever another graph is written, or the same one has other inputs."""
 
 _PROPERTY = "tungsten_dip"
@@ -106,7 +106,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
             "features": model.layout.features,
             "pilots": [asdict(pilot) for pilot in model.layout.pilots],
             "candidates": model.layout.candidate_count,
-            "reference": model.layout.reference,
+            "baseline": model.layout.baseline,
         }
     return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
 
@@ -248,9 +248,9 @@ def _layout(facts: dict[str, Any]) -> Layout:
         if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
             raise InputError("pilots: expected k from 0.01 to 100")
     features = _checked("features", facts.get("features"), tuple[str, ...])
-    candidate_count, reference = (_checked(n, facts.get(n), int) for n in ("candidates", "reference"))
-    layout = Layout(features, tuple(pilots), candidate_count, reference)
-    if not pilots or layout.choices > _MOST_CHOICES or not 0 < reference < layout.choices:
+    candidate_count, baseline = (_checked(n, facts.get(n), int) for n in ("candidates", "baseline"))
+    layout = Layout(features, tuple(pilots), candidate_count, baseline)
+    if not pilots or layout.choice_count > _MOST_CHOICES or not 0 < baseline < layout.choice_count:
         raise InputError(
             f"layout: expected one pilot or more, and at most {_MOST_CHOICES} images to choose from"
         )

@@ -35,8 +35,9 @@ _MOST_MEMBERS = 16
 def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.ModelProto:
     """Return the model's network with its weights.
 
-    Pointwise: ``inputs`` (N, inputs, H, W), as they come, and ``pilots`` (N, pilots, 3, H, W) give ``color``
-    (N, 3, H, W). Others: ``inputs`` (N, inputs, H, W) give ``color`` (N, outputs, H, W), colour first.
+    Pointwise: ``inputs`` (N, inputs, H, W), as they come, and ``choices`` (N, choices, 3, H, W) give
+    ``color`` (N, 3, H, W). Others: ``inputs`` (N, inputs, H, W) give ``color`` (N, outputs, H, W), colour
+    first.
 
     Raises InputError if the model's weights are not those of its network.
     """
@@ -45,11 +46,11 @@ def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.Model
     shapes: dict[str, tuple[int | str, ...]] = {"inputs": ("N", inputs, "H", "W")}
     outputs = 3
     if model.layout is not None and model.standardisation is not None:
-        shapes["pilots"] = ("N", model.layout.choices, 3, "H", "W")
+        shapes["choices"] = ("N", model.layout.choice_count, 3, "H", "W")
         mean, std = model.standardisation.mean, model.standardisation.std
         if not mean.shape == std.shape == (inputs,):
             raise InputError(f"the model has constants for {mean.size} inputs, and {inputs} inputs")
-        build.pointwise(inputs, model.layout.choices, mean, std)
+        build.pointwise(inputs, model.layout.choice_count, mean, std)
     else:
         name = "head.bias" if model.kind == "skip" else "last.bias"
         outputs = model.weights[name].size if name in model.weights else 3
@@ -74,7 +75,7 @@ class _Network(GraphBuilder):
     def pointwise(
         self, inputs: int, choices: int, mean: npt.NDArray[np.float64], std: npt.NDArray[np.float32]
     ) -> None:
-        """Standardise, choose among the pilots, mix them."""
+        """Standardise, weigh the choices, blend them."""
         # In double precision, as in the fit: an input may vary by little around a large mean.
         exact = self.add("Cast", "inputs", to=TensorProto.DOUBLE)
         centred = self.add("Sub", exact, self.constant("mean", mean.reshape(-1, 1, 1)))
@@ -93,7 +94,7 @@ class _Network(GraphBuilder):
         else:
             parts = self.split(x, [choices] * members, axis=1)
             x = self.add("Mean", *(self.add("Softmax", part, axis=1) for part in parts))
-        mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "pilots")
+        mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "choices")
         self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
 
     def skip(self, inputs: int, outputs: int, channels: tuple[int, ...]) -> None:

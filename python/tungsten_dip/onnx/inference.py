@@ -104,21 +104,9 @@ def infer_fusion(
     if blends_all_samples(settings, following=previous is not None):
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
     fused, all_samples_blend = _fused(model, evidence, all_samples_pilots)
-    image = denoised_image(evidence, fused, all_samples_blend)
+    result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
     progress(1.0, "inferred")
-    return FitResult(
-        color=image.color,
-        settings=settings,
-        seconds=clock.seconds(),
-        iterations=0,
-        error=image.error,
-        estimated_relmse=image.estimated_relmse,
-        halves=image.halves,
-        gain=image.gain,
-        halves_drawn=halved.drawn,
-        model=model,
-        notes=(*evidence.notes, *halved.notes, *image.notes),
-    )
+    return replace(result, model=model)
 
 
 def _fused(
@@ -132,10 +120,10 @@ def _fused(
     rows_at_once = max(1, _RUN_PIXELS // width)
 
     def of_half(half: int) -> tuple[FloatImage, ...]:
-        choices = [[pilot[half] for pilot in evidence.pilots]]
+        to_blend = [[choice[half] for choice in evidence.choices]]
         if all_samples_pilots:
-            choices.append(list(all_samples_pilots))
-        fused = tuple(np.empty_like(evidence.mean) for _ in choices)
+            to_blend.append(list(all_samples_pilots))
+        fused = tuple(np.empty_like(evidence.mean) for _ in to_blend)
         inputs = np.empty((len(model.inputs), min(rows, height), width), np.float32)
         for first in range(0, height, rows):
             end = min(first + rows, height)
@@ -146,9 +134,9 @@ def _fused(
             for row in range(first, end, rows_at_once):
                 part = slice(row, min(row + rows_at_once, end))
                 some = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
-                for image, images in zip(fused, choices, strict=True):
-                    pilots = np.stack([pilot[part].transpose(2, 0, 1) for pilot in images])[None]
-                    color = session.run(["color"], {"inputs": some, "pilots": pilots})[0]
+                for image, images in zip(fused, to_blend, strict=True):
+                    choices = np.stack([choice[part].transpose(2, 0, 1) for choice in images])[None]
+                    color = session.run(["color"], {"inputs": some, "choices": choices})[0]
                     check_finite(color)
                     image[part] = color[0].transpose(1, 2, 0)
         return fused
