@@ -49,6 +49,17 @@ def test_fireflies_side_by_side_do_not_support_one_another() -> None:
     assert limited.halves[0].max() < 200
 
 
+def test_sparse_light_on_black_is_the_image() -> None:
+    rng = np.random.default_rng(7)
+    halves = tuple((rng.random((54, 96, 1)) < 0.005).astype(np.float32).repeat(3, 2) for _ in range(2))
+    limited = limit_fireflies(halves[0], halves[1], 1)
+    assert limited.note is None
+    np.testing.assert_array_equal(limited.halves, halves)
+    mean = (halves[0] + halves[1]) / 2
+    result = denoise(RenderBuffers(Buffer(mean, *halves)), FitSettings("draft", iterations=5))
+    assert result.color.mean() > 0.5 * mean.mean()
+
+
 @pytest.mark.parametrize("radiance", [1e3, 1e8, 1e30])
 def test_a_light_that_both_halves_show_is_left_alone(radiance: float) -> None:
     halves = _halves()
@@ -78,11 +89,17 @@ def test_a_lone_pixel_is_bounded_by_the_other_half() -> None:
 
 def test_a_firefly_before_black_stays_finite() -> None:
     halves = np.zeros((9, 9, 3), np.float32), np.zeros((9, 9, 3), np.float32)
+    halves[0][0] = halves[1][0] = 1
     halves[0][4, 4] = 1e30
     limited = limit_fireflies(*halves, 1).halves
     assert all(np.isfinite(half).all() for half in limited)
     assert limited[0].max() < 1e30
     assert limited[0].min() == 0
+    # By itself it is the image.
+    halves[0][0] = halves[1][0] = 0
+    result = denoise(RenderBuffers(Buffer((halves[0] + halves[1]) / 2, *halves)), FitSettings("draft"))
+    assert np.isfinite(result.color).all()
+    assert result.color.max() > 0
 
 
 def test_limits_scale_with_the_exposure() -> None:

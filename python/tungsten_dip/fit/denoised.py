@@ -83,7 +83,8 @@ def denoised_image(
     estimated, _ = error_from_halves(evidence.halves, pixels, np.float32(RELMSE_EPSILON))
     notes = evidence.notes
     if estimated >= error_of_input:
-        notes = (*notes, "the input is as good as anything fitted to it, and is returned")
+        without = "" if evidence.gain is None else " without its fireflies"
+        notes = (*notes, f"the input{without} is as good as anything fitted to it, and is returned")
         image, fused = evidence.mean, evidence.halves
         epsilon = epsilon_of_renderer(evidence.scale)
         error = bounded_ratio(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
