@@ -336,6 +336,20 @@ def test_a_denoised_picture_without_its_noisy_one_is_a_picture(
     assert_same(again, read_buffers(tmp_path / "rgb_denoised.exr"))
 
 
+def test_a_denoised_file_of_several_parts_without_the_noisy_one_is_denoised_again(tmp_path: Path) -> None:
+    parts = {"rgba": {channel: noise((3, 2)) for channel in "RGB"}, "id": {"id": noise((3, 2), 1)}}
+    save(tmp_path / "in.exr", parts)
+    buffers = read_buffers(tmp_path / "in.exr")
+    result = result_for(buffers)
+    write_denoised(tmp_path / "out.exr", result, buffers)
+    denoised, _, ids = (Part(channels, header, name) for name, channels, header in load(tmp_path / "out.exr"))
+    write_exr(tmp_path / "kept.exr", [denoised, ids])
+    again = read_buffers(tmp_path / "kept.exr")
+    assert same_bits(again.color.mean, result.color)
+    write_denoised(tmp_path / "again.exr", result_for(again, scale=0.25), again)
+    assert_same(again, read_buffers(tmp_path / "again.exr"))
+
+
 @pytest.mark.parametrize("names", ["Y", "RGB"])
 def test_a_denoised_picture_without_its_attributes_is_read_as_the_noisy_one(
     tmp_path: Path, names: str

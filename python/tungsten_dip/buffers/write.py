@@ -116,7 +116,10 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     if single:
         parts = [Part(added | kept, attributes, source.parts[0].name)]
     else:
-        parts = [Part(added, attributes, _DENOISED_PART), *source.parts]
+        name = _DENOISED_PART
+        while any(part.name == name for part in source.parts):
+            name += "_"
+        parts = [Part(added, attributes, name), *source.parts]
     write_exr(path, parts, result.settings.threads)
 
 
