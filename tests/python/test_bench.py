@@ -195,7 +195,10 @@ def test_medians_are_of_the_repeats_that_are_there(tmp_path):
     assert results.medians(measurement().key, 2).seconds == 2
 
 
-@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", ",".join(COLUMNS) + "\nx\n", "\0"])
+HUGE = ",".join(COLUMNS) + "\n" + ",".join(f"{10**400}" if name == "iterations" else "1" for name in COLUMNS)
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", ",".join(COLUMNS) + "\nx\n", "\0", HUGE])
 def test_a_file_of_something_else_is_refused(tmp_path, text):
     path = tmp_path / "results.csv"
     path.write_text(text)

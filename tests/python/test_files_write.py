@@ -362,6 +362,17 @@ def test_a_denoised_picture_without_its_attributes_is_read_as_the_noisy_one(
     assert same_bits(read_buffers(tmp_path / "bare.exr").color.mean, buffers.color.mean)
 
 
+@pytest.mark.parametrize("mapping", ["[" * 100_000, "[]", "{"])
+def test_a_denoised_file_with_damaged_attributes_is_refused(tmp_path: Path, mapping: str) -> None:
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2)) for name in "RGB"}})
+    buffers = read_buffers(tmp_path / "in.exr")
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    [(_, channels, header)] = load(tmp_path / "out.exr")
+    write_exr(tmp_path / "out.exr", [Part(channels, {**header, "tungsten_dip/map": mapping})])
+    with pytest.raises(InputError, match="denoise the original input again"):
+        read_buffers(tmp_path / "out.exr")
+
+
 def test_a_folder_travels_in_half(tmp_path: Path) -> None:
     for key, names in (("color", "RGB"), ("colorVariance", "RGB"), ("depth", "Y")):
         save(tmp_path / f"{key}.exr", {"": dict.fromkeys(names, HALF_WITH_NAN_BITS)})

@@ -18,6 +18,7 @@ import pytest
 
 from moving_camera import write_frames
 from tungsten_dip.buffers import read_buffers, read_image, write_image
+from tungsten_dip.buffers.image_file import read_parts, write_exr
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.fit.model import source_sha256
 from tungsten_dip.fit.settings import FitSettings
@@ -148,6 +149,15 @@ def test_a_frame_that_was_skipped_is_none_to_flicker_against(frames):
     again, _ = work.denoise_frames(several, RUN)
     assert [record.skipped for record in again] == [False, True, False]
     assert again[2].flicker is None
+
+
+def test_a_frame_whose_record_is_damaged_is_done_again(frames):
+    (frame,) = find_frames("noisy/f####", "out/f####.exr", (0,))
+    work.denoise_frames([frame], RUN)
+    for record in ("[" * 100_000, "[]", "{"):
+        (part,) = read_parts(frame.output)
+        write_exr(frame.output, [replace(part, attributes={**part.attributes, work._RECORD: record})])
+        assert work.finished(frame, RUN) is None
 
 
 def test_other_threads_are_no_reason_to_do_it_again(frames):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tungsten_dip.buffers import replacing
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.report.metrics import Comparison
 
 
@@ -49,6 +49,7 @@ class Measurement(Comparison):
 VALUES = tuple(field.name for field in fields(Measurement) if field.name != "key")
 COLUMNS = (*(field.name for field in fields(Key)), *VALUES)
 _INTEGERS = ("repeat", "iterations", "nonfinite")
+_LARGEST = (1 << 63) - 1
 
 
 class Results:
@@ -111,8 +112,13 @@ def _measurement(row: dict[str, str]) -> Measurement:
     values: dict[str, Any] = {}
     for name, text in row.items():
         if name in VALUES or name == "repeat":
-            values[name] = None if text == "" else int(text) if name in _INTEGERS else float(text)
+            values[name] = None if text == "" else _number(name, text)
         else:
             values[name] = text
     key = Key(**{field.name: values.pop(field.name) for field in fields(Key)})
     return Measurement(key=key, **values)
+
+
+def _number(name: str, text: str) -> float:
+    # Larger whole numbers have no median, which is a float.
+    return whole_number(name, int(text), 0, _LARGEST) if name in _INTEGERS else float(text)

@@ -280,7 +280,7 @@ def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, A
             if name not in attributes[ADDED]
         }
         mapping = {str(key): str(value) for key, value in json.loads(attributes[MAP]).items()}
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: its attributes {OWN}* are damaged; denoise the original input again"
         ) from error

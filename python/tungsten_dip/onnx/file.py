@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -276,7 +277,9 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
             return None
         return _checked(name, value, next(a for a in get_args(hint) if a is not type(None)))
     elif hint is float:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        # Compared rather than converted: a whole number in JSON may be larger than any float.
+        largest = sys.float_info.max
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= largest:
             return value
     elif hint is int:
         if type(value) is int and 0 <= value < 1 << 63:

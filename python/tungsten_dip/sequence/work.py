@@ -79,7 +79,7 @@ def finished(frame: Frame, run: Run) -> Record | None:
         if stored.pop("key") != key or not is_whole(frame.output):
             return None
         return Record(**{**stored, "number": frame.number, "output": str(frame.output), "skipped": True})
-    except (AttributeError, InputError, KeyError, TypeError, ValueError):
+    except (AttributeError, InputError, KeyError, RecursionError, TypeError, ValueError):
         return None
 
 
