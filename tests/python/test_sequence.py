@@ -14,8 +14,11 @@ from tungsten_dip.buffers.image_file import write_exr
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import pointwise
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.graphs.sessions import session_from_proto
+from tungsten_dip.onnx import inference
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
 from tungsten_dip.sequence.following import Follower, Models, _typical_error
@@ -467,6 +470,24 @@ def test_the_network_of_followed_frames_is_trained_in_full(tmp_path):
     follower = Follower(replace(DRAFT, iterations=5))
     followed = [follower.denoise(frame.buffers, frame.camera).result for frame in frames]
     assert [result.iterations for result in followed] == [5, 240]
+
+
+@pytest.mark.parametrize("refit", [0, 3])
+def test_every_frame_is_denoised_on_the_device_of_the_settings(tmp_path, monkeypatch, refit):
+    def listed(proto, threads, device="auto"):
+        devices.append(device)
+        return session_from_proto(proto, threads, device)
+
+    devices = []
+    for module in (pointwise, inference):
+        monkeypatch.setattr(module, "session_from_proto", listed)
+    settings = replace(DRAFT, device="cpu", seed=1)
+    follower = Follower(settings, refit)
+    for n in range(2):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        result = follower.denoise(frame.buffers).result
+    assert result.settings == replace(settings, iterations=refit or None)
+    assert set(devices) == {"cpu"}
 
 
 def test_a_few_outliers_tell_of_no_cut(fitted):

@@ -23,7 +23,7 @@ from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.graphs.sessions import session_from_proto
+from tungsten_dip.graphs.sessions import Device, session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
 
@@ -55,14 +55,22 @@ def infer(
     """
     check_type("model", model, Model, "load_model reads one from a file")
     refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
-    settings = _settings(model, threads, refit_steps)
+    # When to stop was a setting of the model's own fit. (A FitSettings checks the threads as well.)
+    settings = replace(
+        model.settings,
+        threads=threads,
+        iterations=refit_steps or None,
+        time_budget_s=None,
+        target_error=None,
+        device="auto",
+    )
     if model.layout is not None and refit_steps:
         return denoise(
             buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
         )
     known = prepared(buffers, candidates, previous, threads)
     if model.layout is not None:
-        result = infer_fusion(model, known.buffers, threads, progress, known.candidates, known.previous)
+        result = infer_fusion(model, known.buffers, settings, progress, known.candidates, known.previous)
     else:
         if refit_steps or known.candidates or known.previous is not None:
             raise InputError("a network of the preset paper takes neither candidates nor refit steps")
@@ -70,30 +78,17 @@ def infer(
     return completed(result, known)
 
 
-def _settings(model: Model, threads: int | None, steps: int = 0) -> FitSettings:
-    # When to stop was a setting of the model's own fit. (A FitSettings checks the threads as well.)
-    return replace(
-        model.settings,
-        threads=threads,
-        iterations=steps or None,
-        time_budget_s=None,
-        target_error=None,
-        device="auto",
-    )
-
-
 def infer_fusion(
     model: Model,
     buffers: RenderBuffers,
-    threads: int | None,
+    settings: FitSettings,
     progress: Progress,
     candidates: Sequence[Halves] = (),
     previous: Halves | None = None,
 ) -> FitResult:
-    """Denoise sanitised buffers with a pointwise network; see `infer`."""
+    """Denoise sanitised buffers with a pointwise network, on the device of the settings; see `infer`."""
     clock = Clock()
     assert model.layout is not None
-    settings = _settings(model, threads)
     unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
         return unchanged
@@ -103,18 +98,18 @@ def infer_fusion(
     all_samples_pilots: tuple[FloatImage, ...] = ()
     if blends_all_samples(settings, following=previous is not None):
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
-    fused, all_samples_blend = _fused(model, evidence, all_samples_pilots)
+    fused, all_samples_blend = _fused(model, evidence, all_samples_pilots, settings.device)
     result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
     progress(1.0, "inferred")
     return replace(result, model=model)
 
 
 def _fused(
-    model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage]
+    model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage], device: Device
 ) -> tuple[Halves, FloatImage | None]:
     """Return the blended pilots of both halves and, if given, of all samples, computed band by band."""
     # Both halves are computed side by side; the network is too small to share.
-    session = session_from_proto(graph_of(model), 1)
+    session = session_from_proto(graph_of(model), 1, device)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     rows_at_once = max(1, _RUN_PIXELS // width)
@@ -154,7 +149,7 @@ def _infer_paper(
     check_inputs(model, images.inputs)
     inputs = network_input(images, settings.seed).transpose(2, 0, 1)[None]
     # Norms of the whole image: no bands here.
-    session = session_from_proto(graph_of(model), thread_count(settings.threads))
+    session = session_from_proto(graph_of(model), thread_count(settings.threads), settings.device)
     output = session.run(["color"], {"inputs": np.ascontiguousarray(inputs)})[0]
     check_finite(output)
     ldr = output[0, :3].transpose(1, 2, 0)

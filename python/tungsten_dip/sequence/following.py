@@ -155,12 +155,11 @@ class Follower:
         model = self.models.first if moved is None else self.models.following
         if model is not None:
             steps = _MOST_STEPS if self._refit == "auto" else self._refit
+            settings = replace(self._settings, iterations=steps or None)
             try:
                 if steps == 0:
-                    threads = self._settings.threads
-                    result = infer_fusion(model, buffers, threads, progress, previous=moved)
+                    result = infer_fusion(model, buffers, settings, progress, previous=moved)
                 else:
-                    settings = replace(self._settings, iterations=steps)
                     result = fit_fusion(buffers, settings, progress, warm_start=model, previous=moved)
             except InputError as problem:
                 if last is None:
