@@ -513,6 +513,15 @@ def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path, make_render):
     assert follower.denoise(make_render(20, 30).buffers).how == "cut"
 
 
+def test_a_frame_without_noise_makes_no_cut_of_the_next_one(make_render):
+    follower = Follower(DRAFT)
+    card = make_render(spp=10**9).buffers
+    frames = [make_render(seed=0).buffers, card, make_render(seed=1).buffers]
+    followed = [follower.denoise(frame) for frame in frames]
+    assert followed[1].result.model is None
+    assert [f.how for f in followed] == ["fitted", "followed", "followed"]
+
+
 def test_followed_frames_obey_the_settings(tmp_path):
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     first = Follower(DRAFT).denoise(frames[0].buffers).result.model

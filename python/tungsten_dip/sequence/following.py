@@ -121,7 +121,8 @@ class Follower:
         if result.gain is not None:
             # It is estimated from the fireflies of one frame, and would flicker.
             result = replace(result, color=result.color / result.gain, gain=None)
-        self._error = _typical_error(result)
+        if result.model is not None:  # An image without noise, returned as it is, tells nothing of others.
+            self._error = _typical_error(result)
         self._last = _Last(buffers, smooth, camera, result)
         return replace(followed, result=completed(result, known))
 
