@@ -239,9 +239,19 @@ def test_bad_options_are_one_line(frames, capsys):
     assert not outputs(frames)
 
 
-def test_a_refused_run_leaves_no_folder(frames):
-    for more in (("-o", "out/f####.png"), ("--report", "page.txt"), ("--save-model", "missing/model.onnx")):
-        assert main(arguments(*more)) == 2
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("-o", "out/f####.png"),
+        ("--report", "page.txt"),
+        ("--save-model", "missing/model.onnx"),
+        ("-o", "out/deep/f####.exr", "--report", "missing/page.html"),
+        ("-o", f"out/{300 * 'a'}/f####.exr"),
+    ],
+)
+def test_a_refused_run_leaves_no_folder(frames, capsys, more):
+    assert main(arguments(*more)) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
     assert not (frames / "out").exists()
 
 

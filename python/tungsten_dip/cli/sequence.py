@@ -132,16 +132,17 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _make_writable(folder: Path, results: Sequence[tuple[Path | None, str]]) -> None:
-    """Make the folder of the frames; none is left of a run whose results cannot be saved."""
-    is_new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
+    """Make the folder of the frames, in which others may lie; none is left where one cannot be saved."""
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         for file, suffix in results:
             if file is not None:
                 check_writable(file, (suffix,))
-    except InputError:
-        if is_new:
-            folder.rmdir()
+    except (InputError, OSError):
+        for each in new:
+            with suppress(OSError):  # such as that it was not made
+                each.rmdir()
         raise
 
 
