@@ -355,8 +355,10 @@ def test_more_samples_cost_what_they_take_beyond_the_noisy_render(
 def test_plans_that_cannot_be_followed_are_refused(bench_set, tmp_path, capfd, folder):
     with pytest.raises(InputError, match="expected some of presets, budgets"):
         Plan(("ours",))
-    with pytest.raises(InputError, match="repeats: expected a number above 0"):
-        Plan(repeats=0)
+    for name in ("repeats", "paper_iterations", "threads"):
+        for value in (0, 0.5):
+            with pytest.raises(InputError, match=f"{name}: expected a whole number from 1 to"):
+                Plan(**{name: value})
     with pytest.raises(InputError, match="no such file"):
         run_pareto([bench_set], Plan(denoiser=tmp_path / "none"), tmp_path)
     command_line = ["bench", "pareto", str(folder), "-o", str(tmp_path / "out")]

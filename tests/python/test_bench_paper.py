@@ -149,7 +149,7 @@ def test_rows_scenes_and_iterations_that_are_none_are_refused(bench_set, tmp_pat
         run_paper_table(bench_set, tmp_path, rows=(1, 14))
     with pytest.raises(InputError, match="cornell-box, car2, lamp, got house"):
         run_paper_table(bench_set, tmp_path, scene="house")
-    with pytest.raises(InputError, match="iterations: expected a number above 0"):
+    with pytest.raises(InputError, match="iterations: expected a whole number from 1"):
         run_paper_table(bench_set, tmp_path, iterations=0)
     assert list(tmp_path.iterdir()) == []
 
@@ -219,7 +219,7 @@ def test_iterations_are_timed_side_by_side():
         (["--size", "500x288"], "multiples of 32"),
         (["--size", "512x32"], "from 64 on"),
         (["--size", "big"], "a size such as 512x288"),
-        (["--repeats", "0"], "repeats: expected a number above 0"),
+        (["--repeats", "0"], "repeats: expected a whole number from 1"),
     ],
 )
 def test_what_cannot_be_timed_is_one_line(arguments, words, capfd):

@@ -119,7 +119,7 @@ def touched(path):
         lambda _: touched("cameras/f0000.json"),
         other_version,
         lambda _: replace(RUN, settings=replace(RUN.settings, seed=1)),
-        lambda _: replace(RUN, refit=2),
+        lambda _: replace(RUN, refit=np.int64(2)),
         lambda _: replace(RUN, mapping={"visibility": "none"}),
         lambda _: replace(RUN, float16=True),
         lambda _: replace(RUN, warm_start_sha256="0123abcd"),

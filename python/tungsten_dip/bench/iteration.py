@@ -16,11 +16,11 @@ from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.plain_skip import PlainFit, PlainSkip
 from tungsten_dip.bench.sets import CROP_MULTIPLE
 from tungsten_dip.buffers import Buffer, RenderBuffers
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit.paper.device import compute_device
 from tungsten_dip.fit.paper.fit import PaperFit
 from tungsten_dip.fit.paper.images import paper_images
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.progress import Progress, silent
 
 WARM_UP = 3
@@ -69,9 +69,8 @@ def time_iterations(
             f"size: expected multiples of {CROP_MULTIPLE} from {2 * CROP_MULTIPLE} on such as 512x288, "
             f"got {width}x{height}"
         )
-    for name, value in (("iterations", iterations), ("repeats", repeats)):
-        if value < 1:
-            raise InputError(f"{name}: expected a number above 0, got {value}")
+    iterations = whole_number("iterations", iterations, 1, MOST_ITERATIONS)
+    repeats = whole_number("repeats", repeats, 1, MOST_ITERATIONS)
     settings = FitSettings("paper", threads=threads, device="cpu")
     images = paper_images(_noise(width, height), settings)
     with compute_device(settings) as device:

@@ -14,12 +14,12 @@ import numpy as np
 from tungsten_dip.bench.nfor import nfor_image
 from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve
 from tungsten_dip.bench.sets import BenchSet
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.oidn import Quality, oidn_image
 from tungsten_dip.fit.paper.constants import ITERATIONS
-from tungsten_dip.fit.settings import FitSettings, Preset
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings, Preset
 from tungsten_dip.hosts import render
 from tungsten_dip.progress import Progress
 from tungsten_dip.scene.parse import load_scene
@@ -99,10 +99,9 @@ class Plan:
         for preset in self.presets:
             if preset not in OUR_PRESETS:
                 raise InputError(f"presets: expected some of {', '.join(OUR_PRESETS)}, got {preset}")
-        for name in ("repeats", "paper_iterations", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{name}: expected a number above 0, got {value}")
+        for name in ("repeats", "paper_iterations"):
+            object.__setattr__(self, name, whole_number(name, getattr(self, name), 1, MOST_ITERATIONS))
+        FitSettings(threads=self.threads)  # which checks them
 
 
 def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]:

@@ -22,12 +22,12 @@ from tungsten_dip.bench.runner import Runner, Task
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import seconds_text
 from tungsten_dip.buffers.render_buffers import RenderBuffers
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
 from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.preparation import prepared
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.progress import Progress, silent
 
 _LOG = logging.getLogger(__name__)
@@ -127,11 +127,9 @@ def run_paper_table(
     if figure:
         require("matplotlib", "the plot")
     published = published_rows(scene)
-    unknown = [number for number in rows or () if not 1 <= number <= len(published)]
-    if unknown:
-        raise InputError(f"rows: expected numbers from 1 to {len(published)}, got {unknown[0]}")
-    if iterations < 1:
-        raise InputError(f"iterations: expected a number above 0, got {iterations}")
+    for number in rows or ():
+        whole_number("rows", number, 1, len(published))
+    iterations = whole_number("iterations", iterations, 1, MOST_ITERATIONS)
     runner = Runner(folder, threads)
     buffers = prepared(bench_set.buffers, threads=threads).buffers
     chosen = [

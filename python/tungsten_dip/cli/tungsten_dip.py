@@ -47,9 +47,9 @@ from tungsten_dip.cli.denoising import (
     write_report,
 )
 from tungsten_dip.cli.sequence import add_sequence
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs, Preset
+from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettings, Inputs, Preset
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.scene.effects import inspect_facts, inspect_text
 from tungsten_dip.scene.parse import load_scene
@@ -163,8 +163,7 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    if options.refit < 0:
-        raise InputError(f"--refit: expected 0 or more steps, got {options.refit}")
+    whole_number("--refit", options.refit, 0, MOST_ITERATIONS)
     model = tungsten_dip.load_model(options.model)
     replace(model.settings, threads=options.threads)  # which checks them, before anything is read
 

@@ -17,13 +17,13 @@ import numpy as np
 from tungsten_dip.buffers.prefilter import prefilter_feature
 from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.onnx.inference import infer_fusion
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
@@ -35,7 +35,6 @@ _LOG = logging.getLogger(__name__)
 Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
-_MOST_REFIT = 10**9
 _MOST_STEPS = 240
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
@@ -74,6 +73,14 @@ class _Last:
     result: FitResult
 
 
+def checked_refit(refit: Refit) -> Refit:
+    """Return "auto" or a number of steps, as Python's own.
+
+    Raises InputError if it is neither.
+    """
+    return refit if refit == "auto" else whole_number("refit, unless auto", refit, 0, MOST_ITERATIONS)
+
+
 class Follower:
     """Denoises frames in their order. ``models`` are the networks so far."""
 
@@ -83,14 +90,12 @@ class Follower:
         Raises InputError if the settings are those of the published method, which has no halves to follow,
         ask for another network than the first one's or a device that is not there, or refit is out of range.
         """
-        if refit != "auto" and not (isinstance(refit, int) and 0 <= refit <= _MOST_REFIT):
-            raise InputError(f"refit: expected auto or a number from 0 to {_MOST_REFIT}, got {refit!r:.40}")
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models
         check_ready(settings, self.models.first)
         self._settings = settings
-        self._refit = refit
+        self._refit = checked_refit(refit)
         self._last: _Last | None = None
         self._error: float | None = None
         self._told_of_depth = False

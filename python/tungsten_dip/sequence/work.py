@@ -22,7 +22,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_scene
-from tungsten_dip.sequence.following import Follower, How, Models, Refit
+from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
 from tungsten_dip.sequence.frames import Frame
 
 _RECORD = OWN + "frame"
@@ -38,6 +38,8 @@ class Run:
 
     ``float16`` stores pictures as 16-bit floats. ``warm_start_sha256`` is that of the file of the model that
     the first frame starts from, if any.
+
+    Raises InputError if ``refit`` cannot be done.
     """
 
     settings: FitSettings = field(default_factory=FitSettings)
@@ -45,6 +47,9 @@ class Run:
     mapping: dict[str, str] = field(default_factory=dict)
     float16: bool = False
     warm_start_sha256: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "refit", checked_refit(self.refit))
 
 
 @dataclass(frozen=True)
