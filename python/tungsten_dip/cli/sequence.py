@@ -24,8 +24,8 @@ from tungsten_dip.cli.denoising import (
     fit_settings,
     load_warm_start,
 )
+from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, whole_number
-from tungsten_dip.fit.settings import MOST_THREADS
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 

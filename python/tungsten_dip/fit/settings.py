@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, check_choice, positive_number, whole_number
 
 Preset = Literal["draft", "balanced", "final", "paper"]
@@ -15,7 +16,6 @@ PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 
 
 MOST_ITERATIONS = 10**9
-MOST_THREADS = 1024
 
 _WHOLE_NUMBERS = (
     ("iterations", 1, MOST_ITERATIONS),
