@@ -15,7 +15,7 @@ from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.report import html
 from tungsten_dip.report.html import Picture, View
 from tungsten_dip.report.preview import block_means, error_in_false_color
-from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP, display_from_radiance
+from tungsten_dip.scene.tonemap import display_from_radiance
 
 DETAILS = 2
 DETAIL_FRACTION = 1 / 6
@@ -44,10 +44,8 @@ def _set_parts(each: SetRows) -> Iterator[str]:
     yield html.table(COLUMNS, [cells(row) for row in each.rows], 1, each.front())
 
     images = {row.label: row.image for row in each.rows if row.image is not None}
-    pictures = [Picture("reference", display_from_radiance(each.bench_set.reference, DEFAULT_TONEMAP))]
-    pictures += [
-        Picture(label, display_from_radiance(image, DEFAULT_TONEMAP)) for label, image in images.items()
-    ]
+    pictures = [Picture("reference", display_from_radiance(each.bench_set.reference))]
+    pictures += [Picture(label, display_from_radiance(image)) for label, image in images.items()]
     denoised = [p.pixels for p in pictures if p.label not in ("reference", NOISY)]
     corners = _details(denoised or [p.pixels for p in pictures])
     side = _detail_side(pictures[0].pixels)

@@ -17,7 +17,7 @@ from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import Row, SetRows
 from tungsten_dip.buffers import FloatImage, replacing
-from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP, display_from_radiance
+from tungsten_dip.scene.tonemap import display_from_radiance
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -277,7 +277,7 @@ def write_iterations_plot(
         axes.legend(frameon=False)
         for column, (label, image) in enumerate(shown):
             below = figure.add_subplot(grid[1, column])
-            below.imshow(display_from_radiance(image, DEFAULT_TONEMAP), interpolation="antialiased")
+            below.imshow(display_from_radiance(image), interpolation="antialiased")
             below.set_axis_off()
             below.set_title(label, fontsize=9, color=PRINTED.ink)
         _save(figure, folder / "iterations")

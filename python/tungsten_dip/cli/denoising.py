@@ -102,11 +102,11 @@ def write_report(
     title: str,
     buffers: RenderBuffers,
     result: FitResult,
-    tonemap: TonemapName,
     remarks: Sequence[str],
+    tonemap: TonemapName = "gamma",
 ) -> None:
     """Write the HTML page whole or not at all."""
-    write_text(path, report_page(title, buffers, result, tonemap, remarks))
+    write_text(path, report_page(title, buffers, result, remarks, tonemap))
 
 
 def _name_and_channel(text: str) -> tuple[str, str]:

@@ -27,7 +27,6 @@ from tungsten_dip.cli.denoising import (
 from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.interrupts import held_interrupts
-from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -210,7 +209,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
 def _write_report(path: Path, title: str, records: Sequence[Record]) -> None:
     from tungsten_dip.sequence.page import sequence_page
 
-    write_text(path, sequence_page(title, records, DEFAULT_TONEMAP))
+    write_text(path, sequence_page(title, records))
 
 
 def _refit(text: str) -> int | str:

@@ -75,7 +75,7 @@ def write_outputs(
     write_image(png, denoised)
     write_image(pair, side_by_side(noisy, denoised))
     if report is not None:
-        write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, tonemap, remarks)
+        write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, remarks, tonemap)
     for written in filter(None, (exr, png, pair, report)):
         _LOG.info("wrote %s", written)
     if save_model is not None:

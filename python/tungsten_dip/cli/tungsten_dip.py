@@ -53,7 +53,6 @@ from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettin
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.scene.effects import inspect_facts, inspect_text
 from tungsten_dip.scene.parse import load_scene
-from tungsten_dip.scene.tonemap import DEFAULT_TONEMAP
 
 INPUT_HELP = "a folder of Tungsten's buffers, a scene that names them, or a multi-layer EXR"
 
@@ -201,7 +200,7 @@ def _denoised(
     if options.report is not None:
         named = options.input.name not in ("", "..")  # a link has a name of its own
         name = (options.input if named else options.input.resolve()).name
-        write_report(options.report, name, buffers, result, DEFAULT_TONEMAP, remarks)
+        write_report(options.report, name, buffers, result, remarks)
     if options.error_map is not None:
         assert result.error is not None
         write_error_map(options.error_map, result.error, buffers)

@@ -24,7 +24,11 @@ _CURVE_HEIGHT = 260
 
 
 def report_page(
-    title: str, buffers: RenderBuffers, result: FitResult, tonemap: TonemapName, remarks: Sequence[str] = ()
+    title: str,
+    buffers: RenderBuffers,
+    result: FitResult,
+    remarks: Sequence[str] = (),
+    tonemap: TonemapName = "gamma",
 ) -> str:
     """Return the page for one fit, its pictures displayed with one of Tungsten's tonemaps.
 

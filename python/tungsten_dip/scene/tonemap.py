@@ -12,15 +12,14 @@ from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.types import TonemapName
 
-DEFAULT_TONEMAP: TonemapName = "gamma"
-"""Tungsten's default."""
-
 # Every curve is flat up here; beyond it the squares in the filmic one would overflow.
 _SATURATED = np.float32(1e6)
 
 
-def display_from_radiance(radiance: FloatImage, tonemap: TonemapName) -> FloatImage:
+def display_from_radiance(radiance: FloatImage, tonemap: TonemapName = "gamma") -> FloatImage:
     """Return display values in [0, 1] of linear radiance, any shape; NaN and negative radiance become black.
+
+    The default is Tungsten's.
 
     Raises InputError if Tungsten has no such tonemap.
     """

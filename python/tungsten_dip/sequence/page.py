@@ -13,7 +13,6 @@ from tungsten_dip.report.html import Picture
 from tungsten_dip.report.line_plot import Label, Point, line_plot
 from tungsten_dip.report.preview import block_means
 from tungsten_dip.scene.tonemap import display_from_radiance
-from tungsten_dip.scene.types import TonemapName
 from tungsten_dip.sequence.work import Record
 
 _MOST_PICTURES = 24
@@ -27,7 +26,7 @@ _FLICKER_NOTE = (
 )
 
 
-def sequence_page(title: str, records: Sequence[Record], tonemap: TonemapName) -> str:
+def sequence_page(title: str, records: Sequence[Record]) -> str:
     """Return the page, in HTML that needs no network.
 
     Pictures are read from the records' outputs: all, or as many evenly spaced ones as a page can hold.
@@ -35,7 +34,7 @@ def sequence_page(title: str, records: Sequence[Record], tonemap: TonemapName) -
     done = [record for record in records if record.error is None]
     body = [
         html.figures(_figures(records)),
-        html.gallery(_strip(done, tonemap), "crops"),
+        html.gallery(_strip(done), "crops"),
         "<h2>Time</h2>",
         _plot(done, "seconds", lambda record: record.seconds),
         "<h2>Estimated relMSE</h2>",
@@ -65,12 +64,12 @@ def _figures(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
         yield "without a result", str(failures)
 
 
-def _strip(done: Sequence[Record], tonemap: TonemapName) -> Iterator[Picture]:
+def _strip(done: Sequence[Record]) -> Iterator[Picture]:
     chosen = np.unique(np.linspace(0, len(done) - 1, min(len(done), _MOST_PICTURES)).round().astype(int))
     for record in (done[index] for index in chosen if done):
         color = read_image(Path(record.output))
         smaller = block_means(color, max(1, round(color.shape[1] / _PICTURE_WIDTH)))
-        yield Picture(f"frame {record.number}", display_from_radiance(smaller.astype(np.float32), tonemap))
+        yield Picture(f"frame {record.number}", display_from_radiance(smaller.astype(np.float32)))
 
 
 def _row(record: Record) -> tuple[str, ...]:
