@@ -54,13 +54,13 @@ def result(render):
     )
 
 
-def test_a_note_that_was_logged_is_shown_once(render, result):
-    html = report_page("room", render.buffers, result, ["repaired 3 NaN", *result.notes])
+def test_a_line_that_was_logged_again_is_shown_once(render, result):
+    html = report_page("room", render.buffers, result, [*result.notes, "wrote preview.png", *result.notes])
     assert html.count("no visibility: fitted without") == 1
 
 
 def test_the_page_shows_everything_and_needs_no_network(render, result):
-    html = report_page("A <b>room</b>", render.buffers, result, ["repaired 3 NaN"], "filmic")
+    html = report_page("A <b>room</b>", render.buffers, result, ["repaired 3 NaN", *result.notes], "filmic")
     page = Page(html)
     images = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
     assert set(images) == {"noisy", "denoised", "albedo", "normal", "depth", "estimated error"}
@@ -80,7 +80,7 @@ def test_the_page_shows_everything_and_needs_no_network(render, result):
 
 
 def test_the_curve_goes_through_every_point(render, result):
-    page = Page(report_page("room", render.buffers, result))
+    page = Page(report_page("room", render.buffers, result, result.notes))
     (line,) = (attributes["points"] for tag, attributes in page.elements if tag == "polyline")
     x, y = np.array([point.split(",") for point in line.split()], dtype=float).T
     history = result.history[1:]
@@ -110,7 +110,7 @@ def test_ticks_enclose_the_errors(low, high, ticks):
 def test_what_is_not_known_is_not_shown(error, render):
     buffers = RenderBuffers(Buffer(render.buffers.color.mean))
     fitted = FitResult(render.reference, FitSettings(), 1.0, 10, history=(HistoryPoint(1.0, 10, error),))
-    page = Page(report_page("room", buffers, fitted))
+    page = Page(report_page("room", buffers, fitted, ()))
     tags = [tag for tag, _ in page.elements]
     assert images_of(page) == ["noisy", "denoised"]
     assert "svg" not in tags
@@ -127,7 +127,7 @@ def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
     error = np.full((height, width, 1), np.nan, np.float32)
     history = (HistoryPoint(0.0, 1, 0.1), HistoryPoint(0.0, 2, 0.1))
     fitted = FitResult(color, FitSettings("paper"), 0.0, 2, error, 0.1, history)
-    page = Page(report_page("small", small.buffers, fitted, tonemap="reinhard"))
+    page = Page(report_page("small", small.buffers, fitted, (), "reinhard"))
     assert "all+random" in page.text
     assert not re.search(r"\bnan\b", page.text)
 
@@ -175,7 +175,7 @@ def test_no_error_at_all_is_dark():
 
 def test_the_page_works_in_a_browser(render, result, tmp_path):
     path = tmp_path / "report.html"
-    path.write_text(report_page("A room with " + "a_long_name" * 9, render.buffers, result, tonemap="filmic"))
+    path.write_text(report_page("A room with " + "a_long_name" * 9, render.buffers, result, result.notes))
     assert_page_works(path)
 
 

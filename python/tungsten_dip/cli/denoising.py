@@ -1,4 +1,4 @@
-"""What both commands do to denoise: their settings as options, the fit with its progress, the report."""
+"""What both commands do to denoise: their settings as options, the fit with its progress, the network."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args, get_type_hints
 
-from tungsten_dip.buffers import RenderBuffers, write_text
+from tungsten_dip.buffers import RenderBuffers
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
@@ -16,8 +16,6 @@ from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings, Preset
 from tungsten_dip.interrupts import held_interrupts
-from tungsten_dip.report.page import report_page
-from tungsten_dip.scene.types import TonemapName
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -95,18 +93,6 @@ def write_model(path: Path, result: FitResult) -> None:
     if result.model is None:
         raise InputError(f"{path}: not written: no network was fitted, as the image has no noise")
     save_model(path, result.model)
-
-
-def write_report(
-    path: Path,
-    title: str,
-    buffers: RenderBuffers,
-    result: FitResult,
-    remarks: Sequence[str],
-    tonemap: TonemapName = "gamma",
-) -> None:
-    """Write the HTML page whole or not at all."""
-    write_text(path, report_page(title, buffers, result, remarks, tonemap))
 
 
 def _name_and_channel(text: str) -> tuple[str, str]:

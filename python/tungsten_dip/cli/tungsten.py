@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import tungsten_dip
-from tungsten_dip.buffers import CHANNELS, RenderBuffers, check_writable, write_denoised, write_image
+from tungsten_dip.buffers import (
+    CHANNELS,
+    RenderBuffers,
+    check_writable,
+    write_denoised,
+    write_image,
+    write_text,
+)
 from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
@@ -22,7 +29,6 @@ from tungsten_dip.cli.denoising import (
     fit_settings,
     load_warm_start,
     write_model,
-    write_report,
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
 from tungsten_dip.errors import InputError
@@ -35,6 +41,7 @@ from tungsten_dip.hosts.native import run_native
 from tungsten_dip.interrupts import held_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
+from tungsten_dip.report.page import report_page
 from tungsten_dip.report.preview import side_by_side
 from tungsten_dip.scene.effects import decision_of
 from tungsten_dip.scene.parse import load_scene
@@ -75,7 +82,8 @@ def write_outputs(
     write_image(png, denoised)
     write_image(pair, side_by_side(noisy, denoised))
     if report is not None:
-        write_report(report, exr.stem.removesuffix("_denoised"), buffers, result, remarks, tonemap)
+        title = exr.stem.removesuffix("_denoised")
+        write_text(report, report_page(title, buffers, result, remarks, tonemap))
     for written in filter(None, (exr, png, pair, report)):
         _LOG.info("wrote %s", written)
     if save_model is not None:

@@ -19,6 +19,7 @@ from tungsten_dip.buffers import (
     read_image,
     write_denoised,
     write_error_map,
+    write_text,
 )
 from tungsten_dip.buffers.image_file import first_pixel
 from tungsten_dip.buffers.read import input_files
@@ -44,13 +45,13 @@ from tungsten_dip.cli.denoising import (
     fit_settings,
     load_warm_start,
     write_model,
-    write_report,
 )
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettings, Inputs, Preset
 from tungsten_dip.remarks import remarks_from_log
+from tungsten_dip.report.page import report_page
 from tungsten_dip.scene.effects import inspect_facts, inspect_text
 from tungsten_dip.scene.parse import load_scene
 
@@ -200,7 +201,7 @@ def _denoised(
     if options.report is not None:
         named = options.input.name not in ("", "..")  # a link has a name of its own
         name = (options.input if named else options.input.resolve()).name
-        write_report(options.report, name, buffers, result, remarks)
+        write_text(options.report, report_page(name, buffers, result, remarks))
     if options.error_map is not None:
         assert result.error is not None
         write_error_map(options.error_map, result.error, buffers)

@@ -27,13 +27,13 @@ def report_page(
     title: str,
     buffers: RenderBuffers,
     result: FitResult,
-    remarks: Sequence[str] = (),
+    lines: Sequence[str],
     tonemap: TonemapName = "gamma",
 ) -> str:
     """Return the page for one fit, its pictures displayed with one of Tungsten's tonemaps.
 
-    ``remarks`` are lines on the input (how its layers were assigned, what was repaired); the fit's notes
-    follow, except for those that are among the remarks already.
+    ``lines`` are what was logged of the input and the fit: how layers were assigned, what was repaired, the
+    notes of the result. What came again, such as with every preview, is shown once.
     """
     features = list(_features(buffers))
     pictures = [
@@ -41,7 +41,7 @@ def report_page(
         Picture("denoised", display_from_radiance(result.color, tonemap)),
         *features,
     ]
-    notes = list(dict.fromkeys([*remarks, *result.notes]))
+    notes = list(dict.fromkeys(lines))
     body = [
         html.figures(_figures(result)),
         html.comparison(pictures, left=0, right=1),
@@ -104,7 +104,7 @@ def _error_map(result: FitResult) -> Iterator[str]:
 
 def _curve(history: Sequence[HistoryPoint]) -> Iterator[str]:
     """Yield the estimated relMSE over seconds as an SVG, its axis logarithmic, if there is a line to draw."""
-    # An estimate without bias may fall below zero where the error is tiny; a logarithm cannot show it.
+    # Where no error is left to see, its estimate is 0, which a logarithm cannot show.
     known = [(p, relmse) for p in history if (relmse := p.estimated_relmse) is not None and relmse > 0]
     if len(known) < 2:
         return
