@@ -45,18 +45,18 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def check_suffix(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
+def check_suffix(path: Path, *suffixes: str) -> None:
     """Raise InputError if a name ends in none of these."""
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
 
 
-def check_writable(path: Path, suffixes: tuple[str, ...] = (".exr",)) -> None:
+def check_writable(path: Path, *suffixes: str) -> None:
     """Check before long work that its result can be saved as ``path``.
 
     Raises InputError if the suffix is none of ``suffixes``, or if no file can be created there.
     """
-    check_suffix(path, suffixes)
+    check_suffix(path, *suffixes)
     try:
         if path.is_dir():
             raise InputError(f"{path}: expected the name of a file, this is a folder")

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
-from tungsten_dip.buffers.atomic import is_utf8, replacing
+from tungsten_dip.buffers.atomic import check_suffix, is_utf8, replacing
 from tungsten_dip.buffers.render_buffers import FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
@@ -195,8 +195,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in (*RADIANCE_SUFFIXES, ".png"):
-        raise InputError(f"{path}: expected a name that ends in {', '.join(RADIANCE_SUFFIXES)} or .png")
+    check_suffix(path, *RADIANCE_SUFFIXES, ".png")
     check_array(str(path), image)
     if image.ndim != 3 or image.shape[2] not in (1, 3) or image.size == 0:
         raise InputError(

@@ -23,6 +23,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from tungsten_dip.buffers.atomic import check_suffix
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.render_buffers import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
@@ -81,8 +82,7 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     buffers or no numbers; an existing file then stays as it was.
     """
     path = Path(path)
-    if path.suffix.lower() != ".exr":
-        raise InputError(f"{path}: expected a name that ends in .exr, which holds all layers")
+    check_suffix(path, ".exr")
     check_type("buffers", buffers, RenderBuffers, "give those that the result was made from")
     color = _of_result("color", result.color, buffers, 3)
     source = buffers.source or _source_from_buffers(buffers)

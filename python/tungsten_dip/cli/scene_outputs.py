@@ -80,9 +80,9 @@ class SceneOutputs:
     def check(self) -> None:
         """Raise InputError if one of the files cannot be written, or would be written over another one."""
         for path in filter(None, [self.ldr, *(_path(buffer.ldr_output_file) for buffer in self.buffers)]):
-            check_writable(path, _LDR)
+            check_writable(path, *_LDR)
         for path in filter(None, [self.hdr, *(_path(buffer.hdr_output_file) for buffer in self.buffers)]):
-            check_writable(path, _HDR)
+            check_writable(path, *_HDR)
         held: dict[Path, str] = {}
         for path, content in self.files():
             other = held.setdefault(path.resolve(), content)

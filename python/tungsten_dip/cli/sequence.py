@@ -91,7 +91,7 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     results = [(frames[0].output, ".exr"), (options.report, ".html"), (options.save_model, ".onnx")]
     for file, suffix in results:
         if file is not None:
-            check_suffix(file, (suffix,))
+            check_suffix(file, suffix)
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
@@ -137,7 +137,7 @@ def _make_writable(folder: Path, results: Sequence[tuple[Path | None, str]]) -> 
         folder.mkdir(parents=True, exist_ok=True)
         for file, suffix in results:
             if file is not None:
-                check_writable(file, (suffix,))
+                check_writable(file, suffix)
     except (InputError, OSError):
         for each in new:
             with suppress(OSError):  # such as that it was not made

@@ -264,7 +264,7 @@ def _checked_outputs(
     if options.dip_preview:
         own.append(outputs.preview())
     for file in own:
-        check_writable(file, (file.suffix,))
+        check_writable(file, file.suffix)
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
     check_no_input(sorted(rendered | derived), {file.resolve() for file in scene.files})
     both = rendered & derived
@@ -277,9 +277,9 @@ def _checked_outputs(
             "scene file names of its own"
         )
     if options.report is not None:
-        check_writable(options.report, (".html",))
+        check_writable(options.report, ".html")
     if options.save_model is not None:
-        check_writable(options.save_model, (".onnx",))
+        check_writable(options.save_model, ".onnx")
     return outputs, rendered | derived
 
 

@@ -185,7 +185,7 @@ def _denoised(
     suffixes = {"output": ".exr", "error_map": ".exr", "report": ".html", "save_model": ".onnx"}
     for name, suffix in suffixes.items():
         if getattr(options, name) is not None:
-            check_writable(getattr(options, name), (suffix,))
+            check_writable(getattr(options, name), suffix)
     if options.error_map is not None and options.error_map.resolve() == options.output.resolve():
         raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 

@@ -56,7 +56,7 @@ def save_model(path: str | Path, model: Model) -> None:
     """
     check_type("model", model, Model, "a fit returns it as result.model, None if the image has no noise")
     path = Path(path)
-    check_writable(path, (".onnx",))
+    check_writable(path, ".onnx")
     content = proto_from_model(model).SerializeToString(deterministic=True)
     if len(content) > LARGEST_FILE_BYTES:
         raise InputError(
