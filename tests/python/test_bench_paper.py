@@ -92,8 +92,12 @@ def curves(monkeypatch):
     return begun
 
 
+def paper_table_of(bench_set, folder, *, scene=SCENES[0], iterations=1, rows=None):
+    return run_paper_table(bench_set, folder, scene=scene, iterations=iterations, rows=rows, threads=1)
+
+
 def test_the_whole_table_is_written_and_not_measured_twice(bench_set, curves, tmp_path):
-    text = run_paper_table(bench_set, tmp_path, iterations=3, threads=1)
+    text = paper_table_of(bench_set, tmp_path, iterations=3)
     assert len(curves) == 14
     assert text == (tmp_path / "paper.md").read_text()
     lines = [line for line in text.splitlines() if line.startswith("|")]
@@ -110,9 +114,9 @@ def test_the_whole_table_is_written_and_not_measured_twice(bench_set, curves, tm
     assert (tmp_path / "iterations.png").read_bytes().startswith(b"\x89PNG")
     assert "to reference" in (tmp_path / "iterations.svg").read_text()
 
-    assert run_paper_table(bench_set, tmp_path, iterations=3, threads=1) == text
+    assert paper_table_of(bench_set, tmp_path, iterations=3) == text
     assert len(curves) == 14
-    other = run_paper_table(bench_set, tmp_path, iterations=3, threads=1, scene="lamp", figure=False)
+    other = paper_table_of(bench_set, tmp_path, iterations=3, scene="lamp")
     assert "26.33" in other
     assert len(curves) == 14
 
@@ -124,12 +128,12 @@ def test_some_rows_can_be_chosen_and_go_on_after_an_interrupt(bench_set, curves,
         curves.append(settings)
         return paper_curve(buffers, settings, checkpoints, progress)
 
-    choice = {"iterations": 2, "rows": (2, 9), "figure": False, "threads": 1}
+    choice = {"iterations": 2, "rows": (2, 9)}
     with monkeypatch.context() as patch:
         patch.setattr(methods, "paper_curve", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            run_paper_table(bench_set, tmp_path, **choice)
-    run_paper_table(bench_set, tmp_path, **choice)
+            paper_table_of(bench_set, tmp_path, **choice)
+    paper_table_of(bench_set, tmp_path, **choice)
     assert [settings.network for settings in curves] == ["skip", "resnet"]
     assert not (tmp_path / "iterations.png").exists()
 
@@ -138,7 +142,7 @@ def test_a_row_without_its_feature_is_left_out_and_that_is_said(bench_set, curve
     buffers = bench_set.buffers.with_quantities(albedo=None)
     without = BenchSet("room", buffers, bench_set.reference, None, "other")
     with caplog.at_level(logging.WARNING):
-        text = run_paper_table(without, tmp_path, iterations=1, rows=(3, 4), figure=False, threads=1)
+        text = paper_table_of(without, tmp_path, iterations=1, rows=(3, 4))
     assert [settings.inputs for settings in curves] == ["depths"]
     assert "| 4 |" not in text
     assert "row 4 is left out: inputs albedos" in caplog.text
@@ -146,11 +150,11 @@ def test_a_row_without_its_feature_is_left_out_and_that_is_said(bench_set, curve
 
 def test_rows_scenes_and_iterations_that_are_none_are_refused(bench_set, tmp_path):
     with pytest.raises(InputError, match="from 1 to 13, got 14"):
-        run_paper_table(bench_set, tmp_path, rows=(1, 14))
+        paper_table_of(bench_set, tmp_path, rows=(1, 14))
     with pytest.raises(InputError, match="cornell-box, car2, lamp, got house"):
-        run_paper_table(bench_set, tmp_path, scene="house")
+        paper_table_of(bench_set, tmp_path, scene="house")
     with pytest.raises(InputError, match="iterations: expected a whole number from 1"):
-        run_paper_table(bench_set, tmp_path, iterations=0)
+        paper_table_of(bench_set, tmp_path, iterations=0)
     assert list(tmp_path.iterdir()) == []
 
 

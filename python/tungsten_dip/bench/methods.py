@@ -241,8 +241,15 @@ def _nfor(bench_set: BenchSet, plan: Plan) -> Iterator[Method]:
     elif bench_set.nfor is not None:
         saved = Outcome(label, bench_set.nfor, plan.nfor_s)
         settings = f"saved, {plan.nfor_s:g} s" if plan.nfor_s else "saved"
-        unmeasured = Method(NFOR, (label,), ("",), settings, lambda repeat, progress: [saved], timed=False)
-        yield replace(unmeasured, pictured=(label,))
+        yield Method(
+            NFOR,
+            (label,),
+            ("",),
+            settings,
+            lambda repeat, progress: [saved],
+            timed=False,
+            pictured=(label,),
+        )
     else:
         _LOG.info(
             "%s: no nfor.exr beside the buffers and no denoiser named: NFOR is left out", bench_set.name

@@ -24,7 +24,6 @@ from tungsten_dip.bench.table import seconds_text
 from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
-from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
@@ -107,24 +106,23 @@ def run_paper_table(
     bench_set: BenchSet,
     folder: Path,
     *,
-    scene: str = SCENES[0],
-    iterations: int = ITERATIONS,
-    rows: Sequence[int] | None = None,
-    figure: bool = True,
-    threads: int | None = None,
+    scene: str,
+    iterations: int,
+    rows: Sequence[int] | None,
+    threads: int | None,
     progress: Progress = silent,
 ) -> str:
     """Fit every row, and return the table in Markdown, the published figures of ``scene`` beside ours.
 
-    ``rows`` None takes all 13. The folder is one of a `Runner`, in which a run resumes; in
-    the end it contains ``paper.md`` and ``paper.csv`` with the rows that are known, and, with ``figure``,
-    ``iterations.svg`` and ``iterations.png``.
+    ``rows`` None takes all 13, and the figure of the iterations' effect. The folder is one of a `Runner`, in
+    which a run resumes; in the end it contains ``paper.md`` and ``paper.csv`` with the rows that are known
+    and, with the figure, ``iterations.svg`` and ``iterations.png``.
 
     A row whose feature is missing is left out and logged.
 
     Raises InputError if a row is not one of the 13.
     """
-    if figure:
+    if rows is None:
         require("matplotlib", "the plot")
     published = published_rows(scene)
     for number in rows or ():
@@ -140,7 +138,7 @@ def run_paper_table(
     ]
     methods = {row.number: _row_method(bench_set, row, iterations, threads) for row in chosen}
     curve = _curve_method(bench_set, iterations, threads)
-    tasks = [Task(bench_set, method) for method in (*methods.values(), *((curve,) if figure else ()))]
+    tasks = [Task(bench_set, method) for method in (*methods.values(), *((curve,) if rows is None else ()))]
     runner.run(runner.missing(tasks), progress)
 
     found = [
@@ -149,7 +147,7 @@ def run_paper_table(
     text = _markdown(bench_set, scene, iterations, found, threads)
     runner.write_text("paper.md", text)
     runner.write_text("paper.csv", _csv(found))
-    if figure:
+    if rows is None:
         medians = [runner.median(bench_set, curve, label) for label in curve.labels]
         few = next(index for index, m in enumerate(medians) if (m.iterations or 0) * TOO_FEW >= iterations)
         best = int(np.argmax([median.psnr for median in medians]))

@@ -133,7 +133,6 @@ def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
             scene=options.published or SCENES[0],
             iterations=options.iterations,
             rows=options.rows,
-            figure=options.rows is None,
             threads=options.threads,
             progress=progress,
         )

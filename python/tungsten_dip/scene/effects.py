@@ -64,6 +64,9 @@ _ENVIRONMENT = (InfiniteSphere, InfiniteSphereCap, Skydome)
 _DEFAULT_SKY = "white sky (no light is in the scene)"
 """The light that Tungsten adds to a scene without lights."""
 
+_MOST_LISTED = 4
+"""Names in one line of `inspect_text`."""
+
 
 @dataclass(frozen=True)
 class Effects:
@@ -285,6 +288,6 @@ def _names(items: Iterator[Any]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(f"{item.name} ({item.kind})" if item.name else item.kind for item in items))
 
 
-def _listed(names: tuple[str, ...], most: int = 4) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more if names else "-"
+def _listed(names: tuple[str, ...]) -> str:
+    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return ", ".join(names[:_MOST_LISTED]) + more if names else "-"
