@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from browser import assert_page_works
-from tungsten_dip.bench import methods, plot
+from tungsten_dip.bench import methods, pareto, plot
 from tungsten_dip.bench.methods import Plan, settings_text
 from tungsten_dip.bench.nfor import nfor_image
 from tungsten_dip.bench.pareto import run_pareto
@@ -238,6 +238,18 @@ def test_another_version_image_or_number_of_threads_is_measured_anew(bench_set, 
     monkeypatch.setattr("tungsten_dip.bench.runner.__version__", "99")
     run_pareto([bench_set], plan, tmp_path)
     assert len(fits) == 4
+
+
+def test_warming_up_silences_nobody_else(bench_set, caplog, monkeypatch):
+    def denoise(buffers, settings):
+        logging.getLogger("tungsten_dip.fit").critical("of a discarded result")
+        logging.getLogger("host").info("of the host")
+
+    monkeypatch.setattr(pareto, "denoise", denoise)
+    with caplog.at_level(logging.INFO):
+        pareto._warm_up(bench_set, QUICK, {methods.OURS})
+        logging.getLogger("tungsten_dip.fit").info("afterwards")
+    assert caplog.messages == ["of the host", "afterwards"]
 
 
 def test_an_interrupt_loses_the_measurement_in_hand_alone(bench_set, fits, tmp_path, monkeypatch):

@@ -71,11 +71,13 @@ def _warm_up(bench_set: BenchSet, plan: Plan, series: Collection[str]) -> None:
     height, width = bench_set.buffers.height, bench_set.buffers.width
     middle = [slice(max(0, size // 2 - 32), size // 2 + 32) for size in (height, width)]
     tiny = cropped(bench_set.buffers, (middle[0], middle[1]))
-    logging.disable()  # its results are discarded
+    logger = logging.getLogger("tungsten_dip")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)  # of results that are discarded
     try:
         _warm_up_with(tiny, plan, series)
     finally:
-        logging.disable(logging.NOTSET)
+        logger.setLevel(level)
 
 
 def _warm_up_with(tiny: RenderBuffers, plan: Plan, series: Collection[str]) -> None:
