@@ -12,7 +12,7 @@ The public names are all here and load on first use: importing the package loads
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 
 if TYPE_CHECKING:
     from tungsten_dip.buffers.image_file import write_image
@@ -82,7 +82,7 @@ def __getattr__(name: str) -> Any:
         return import_module("importlib.metadata").version("tungsten-dip")
     if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with held_interrupts():
+    with deferred_interrupts():
         module = import_module(f"{__name__}.{_MODULE_BY_NAME[name]}")
     value = globals()[name] = getattr(module, name)
     return value

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 _LOG = logging.getLogger(__name__)
 
 
-def held_interrupts() -> AbstractContextManager[None]:
+def deferred_interrupts() -> AbstractContextManager[None]:
     """Defer Ctrl-C within the block to its end: for imports of libraries.
 
     An import that is interrupted leaves a module half initialised, or ends the process.
@@ -19,7 +19,7 @@ def held_interrupts() -> AbstractContextManager[None]:
     return _noted_interrupts(at_once=False)
 
 
-def heeded_interrupts() -> AbstractContextManager[None]:
+def reraised_interrupts() -> AbstractContextManager[None]:
     """Raise KeyboardInterrupt on Ctrl-C within the block and, if it is caught there, again at its end.
 
     A fit catches it, and ends early with the result so far.
@@ -28,7 +28,7 @@ def heeded_interrupts() -> AbstractContextManager[None]:
 
 
 @contextmanager
-def requested_interrupts(warning: str) -> Iterator[Callable[[], bool]]:
+def interrupts_as_requests(warning: str) -> Iterator[Callable[[], bool]]:
     """Turn a first Ctrl-C within the block into a request that can be asked for; a second ends the process.
 
     The warning is logged at the first.

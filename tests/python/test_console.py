@@ -19,7 +19,7 @@ from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import console, entry
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.cli.console import duration, minutes, progress_on_stderr
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 
 
 def test_the_package_runs_as_the_command():
@@ -219,7 +219,7 @@ def test_ctrl_c_waits_for_an_import():
     reached = []
 
     def load():
-        with held_interrupts():
+        with deferred_interrupts():
             signal.raise_signal(signal.SIGINT)
             reached.append("the end")
 
@@ -231,7 +231,7 @@ def test_ctrl_c_waits_for_an_import():
 def test_ctrl_c_that_is_ignored_stays_so():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with held_interrupts():
+        with deferred_interrupts():
             signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:

@@ -14,7 +14,7 @@ from tungsten_dip.bench.results import Key, Measurement, Results
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.buffers import FloatImage, read_image, write_image, write_text
 from tungsten_dip.errors import InputError
-from tungsten_dip.interrupts import heeded_interrupts
+from tungsten_dip.interrupts import reraised_interrupts
 from tungsten_dip.progress import Progress, part_of
 from tungsten_dip.report.metrics import compare
 
@@ -62,7 +62,7 @@ class Runner:
             start, end = index / len(tasks), (index + 1) / len(tasks)
             part = part_of(progress, start, end, task.method.labels[-1])
             part(0, task.bench_set.name)
-            with heeded_interrupts():
+            with reraised_interrupts():
                 outcomes = task.method.run(task.repeat, part)
             if task.repeat == 0:
                 for outcome in outcomes:

@@ -15,7 +15,7 @@ from tungsten_dip.fit import denoise
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings, Preset
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -62,7 +62,7 @@ def load_warm_start(options: argparse.Namespace) -> Model | None:
     """Return the model that the fit is to start from, if any."""
     if options.warm_start is None:
         return None
-    with held_interrupts():
+    with deferred_interrupts():
         from tungsten_dip.onnx import load_model  # imports ONNX
 
     return load_model(options.warm_start)

@@ -26,7 +26,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, whole_number
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 
 if TYPE_CHECKING:
     from argparse import _SubParsersAction
@@ -72,7 +72,7 @@ _REFIT_HELP = (
 
 
 def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    with held_interrupts():
+    with deferred_interrupts():
         from tungsten_dip.sequence.cluster import denoise_on_cluster
         from tungsten_dip.sequence.following import Models
         from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers

@@ -38,7 +38,7 @@ from tungsten_dip.hosts import Host, chosen_host
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.hosts.native import run_native
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.report.page import report_page
@@ -329,7 +329,7 @@ def _each_alone(settings: FitSettings, warm_start: Model | None) -> Denoise:
 
 def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoise:
     """Return what denoises scenes as frames, each starting from the one before."""
-    with held_interrupts():
+    with deferred_interrupts():
         from tungsten_dip.sequence.following import Follower, Models
 
     follower = Follower(settings, models=Models(first=warm_start))

@@ -12,7 +12,7 @@ from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.progress import Progress, silent
 
 __all__ = ["FitResult", "FitSettings", "check_ready", "denoise"]
@@ -26,12 +26,12 @@ def check_ready(settings: FitSettings, warm_start: Model | None = None) -> None:
     if settings.preset == "paper":
         require("torch", "preset paper")
         if settings.device == "cuda":
-            with held_interrupts():
+            with deferred_interrupts():
                 from tungsten_dip.fit.paper.device import check_torch_device
 
             check_torch_device(settings.device)
     else:
-        with held_interrupts():
+        with deferred_interrupts():
             from tungsten_dip.graphs.sessions import check_device
 
         check_device(settings.device)
@@ -83,12 +83,12 @@ def denoise(
     if settings.preset == "paper":
         if known.candidates or known.previous is not None:
             raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
-        with held_interrupts():
+        with deferred_interrupts():
             from tungsten_dip.fit.paper.fit import fit_paper
 
         result = fit_paper(known.buffers, settings, progress, warm_start)
     else:
-        with held_interrupts():
+        with deferred_interrupts():
             from tungsten_dip.fit.fusion import fit_fusion
 
         result = fit_fusion(known.buffers, settings, progress, known.candidates, warm_start, known.previous)

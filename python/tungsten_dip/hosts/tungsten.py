@@ -23,7 +23,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.hosts.memory import TUNGSTEN_BYTES_PER_PIXEL, pixels_that_fit, too_large
 from tungsten_dip.hosts.native import BUILD_HINT, executable, render_in_child
 from tungsten_dip.hosts.options import RANGES, checked_option
-from tungsten_dip.interrupts import requested_interrupts
+from tungsten_dip.interrupts import interrupts_as_requests
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import TonemapName
 
@@ -212,7 +212,7 @@ def _render_passes(
     total = max(session.total_spp, 1)
     while not session.done:
         progress(session.current_spp / total, f"{session.current_spp}/{total} spp")
-        with requested_interrupts(
+        with interrupts_as_requests(
             "stopping after this pass; Ctrl-C again stops at once and saves nothing"
         ) as interrupt_requested:
             try:

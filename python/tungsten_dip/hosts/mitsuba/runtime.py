@@ -13,7 +13,7 @@ from typing import Any
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
-from tungsten_dip.interrupts import held_interrupts
+from tungsten_dip.interrupts import deferred_interrupts
 
 _LOG = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ def mitsuba_variant() -> Iterator[ModuleType]:
         Path.cwd()  # without which importing Mitsuba ends the process
     except OSError:
         raise InputError("the working directory does not exist any more; change to one that does") from None
-    with held_interrupts():
+    with deferred_interrupts():
         mitsuba = importlib.import_module("mitsuba")
         previous_variant = mitsuba.variant()
         mitsuba.set_variant(VARIANT)
