@@ -73,7 +73,7 @@ def _sequence(folder: Path) -> Row:
     )
     watch = _Watch()
     tell: Callable[[object], None] = lambda record: watch.note()  # noqa: E731
-    records, _ = denoise_frames(frames, Run(SETTINGS), tell=tell)
+    records, _ = denoise_frames(frames, Run(SETTINGS), on_record=tell)
     row = watch.row(f"a sequence of {FRAMES} frames")
     failed = [f"frame {record.number}: {record.error}" for record in records if record.error]
     return Row(row.what, row.tried, row.held - len(failed), (*row.lost, *failed), row.note)

@@ -54,7 +54,7 @@ def denoise_on_cluster(
     workers: int,
     models: Models,
     progress: Progress,
-    tell: Callable[[Record], None],
+    on_record: Callable[[Record], None],
 ) -> tuple[list[Record], Models]:
     """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes at most.
 
@@ -68,7 +68,7 @@ def denoise_on_cluster(
     frames = [_absolute(frame) for frame in frames]
     to_do, records = split_finished(frames, run)
     for record in records:
-        tell(record)
+        on_record(record)
     workers = min(workers, _tasks_at_once(to_do))
     if run.settings.threads is None:
         share = max(1, thread_count(None) // workers) if scheduler == "local" else 1
@@ -82,7 +82,7 @@ def denoise_on_cluster(
                     _LOG.info("%s", remark)
                 for record in done:
                     records.append(record)
-                    tell(record)
+                    on_record(record)
                     progress(len(records) / len(frames), f"frame {record.number}")
     return sorted(records, key=lambda record: record.number), shared
 

@@ -108,12 +108,13 @@ def denoise_frames(
     run: Run,
     models: Models = Models(),
     progress: Progress = silent,
-    tell: Callable[[Record], None] = lambda _: None,
+    on_record: Callable[[Record], None] = lambda _: None,
 ) -> tuple[list[Record], Models]:
     """Denoise frames one after another; return their records and the networks in the end.
 
     Frames that are finished are skipped; one that cannot be read or written has an error in its record, and
     the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short is not saved.
+    ``on_record`` gets every record as soon as it is known.
     """
     follower = Follower(run.settings, run.refit, models)
     frames = list(frames)
@@ -121,18 +122,18 @@ def denoise_frames(
     for index, frame in enumerate(frames):
         start, end = index / len(frames), (index + 1) / len(frames)
         part = part_of(progress, start, end, f"frame {frame.number}")
-        beside = bool(records) and records[-1].error is None and not records[-1].skipped
+        is_consecutive = bool(records) and records[-1].error is None and not records[-1].skipped
         try:
-            record = finished(frame, run) or _denoise(frame, run, follower, beside, part)
+            record = finished(frame, run) or _denoise(frame, run, follower, is_consecutive, part)
         except (InputError, OSError) as error:
             record = failed(frame, error)
         records.append(record)
-        tell(record)
+        on_record(record)
     return records, follower.models
 
 
-def _denoise(frame: Frame, run: Run, follower: Follower, beside: bool, progress: Progress) -> Record:
-    """Denoise and write a frame; ``beside``: whether the follower's last one is the one before it."""
+def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, progress: Progress) -> Record:
+    """Denoise and write a frame; ``is_consecutive``: whether the follower's last one is the one before it."""
     started = time.perf_counter()
     key = _key(frame, run)
     buffers = read_buffers(frame.input, run.mapping)
@@ -149,7 +150,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, beside: bool, progress:
         seconds=time.perf_counter() - started,
         iterations=result.iterations,
         estimated_relmse=result.estimated_relmse,
-        flicker=followed.flicker if beside else None,
+        flicker=followed.flicker if is_consecutive else None,
     )
     attributes = {**buffers.attributes, _RECORD: json.dumps({"key": key, **asdict(record)})}
     frame.output.parent.mkdir(parents=True, exist_ok=True)
