@@ -8,22 +8,15 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.image_file import (
-    RADIANCE_SUFFIXES,
-    is_folder,
-    radiance_suffixes,
-    read_parts,
-    with_known_suffix,
-)
+from tungsten_dip.buffers.image_file import is_folder, read_parts
 from tungsten_dip.buffers.layers import (
-    MAP_KEYS,
     NOTHING,
     PLANES,
     Found,
@@ -31,17 +24,15 @@ from tungsten_dip.buffers.layers import (
     find_layers,
     mapped_channels,
     names_quantity,
-    planes_of_output,
 )
 from tungsten_dip.buffers.render_buffers import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
+from tungsten_dip.buffers.tungsten_files import files_of_folder, files_of_scene
 from tungsten_dip.errors import InputError
-from tungsten_dip.json_file import object_from_json_file
 
 _LOG = logging.getLogger(__name__)
 
-_SUFFIXES = tuple(PLANES.values())
-_CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix in _SUFFIXES} | {
+_CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix in PLANES.values()} | {
     "alpha": 1,
     "spp": 1,
 }
@@ -65,11 +56,11 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     mapping = dict(mapping or {})
     if is_folder(path):
         excluded = {key: value for key, value in mapping.items() if value == NOTHING}
-        return _from_images(path, *_files_of_folder(path, mapping), excluded)
+        return _from_images(path, *files_of_folder(path, mapping), excluded)
     if path.suffix.lower() == ".json":
         if mapping:
             raise InputError(f"{path}: a scene names its buffers itself; use --map with a folder or an image")
-        return _from_images(path, *_files_of_scene(path), {})
+        return _from_images(path, *files_of_scene(path), {})
     source, attributes = _unwrapped(path, read_parts(path))
     return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
 
@@ -117,104 +108,10 @@ def input_files(path: str | Path, mapping: Mapping[str, str] | None = None) -> l
     """
     path = Path(path)
     if is_folder(path):
-        return list(_files_of_folder(path, dict(mapping or {}))[0].values())
+        return list(files_of_folder(path, dict(mapping or {}))[0].values())
     if path.suffix.lower() == ".json":
-        return [path, *_files_of_scene(path)[0].values()]
+        return [path, *files_of_scene(path)[0].values()]
     return [path]
-
-
-def _files_of_folder(folder: Path, mapping: Mapping[str, str]) -> tuple[dict[str, Path], list[str]]:
-    """Return the file of every plane, and what is ignored."""
-    try:
-        present = sorted(file for file in folder.iterdir() if file.suffix.lower() in RADIANCE_SUFFIXES)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be listed ({error.strerror}); check its permissions") from error
-    present.sort(key=lambda file: RADIANCE_SUFFIXES.index(file.suffix.lower()))
-    unknown = [key for key in mapping if key not in MAP_KEYS or key == "alpha"]
-    if unknown:
-        raise InputError(f"--map {unknown[0]}=...: expected one of {', '.join(MAP_KEYS[:-1])} for a folder")
-    files = {}
-    for quantity in CHANNELS:
-        for suffix in _SUFFIXES:
-            key = quantity + suffix
-            if NOTHING in (mapping.get(key), mapping.get(quantity)):
-                continue
-            wanted = mapping.get(key, key)
-            match = next((file for file in present if wanted in (file.name, file.stem)), None)
-            if match is not None:
-                files[key] = match
-            elif key in mapping:
-                raise InputError(f"--map {key}={wanted}: not in {folder}; there are {_names(present)}")
-    for key, wanted in mapping.items():
-        if wanted != NOTHING and key not in files:
-            raise InputError(f"--map {key}={wanted}: there is no mean that this belongs to; map that too")
-    if "color" not in files:
-        raise InputError(
-            f"{folder}: expected color.exr (.pfm, .hdr), found {_names(present)}; "
-            "render with output_buffers, or use --map color=FILE"
-        )
-    return files, [file.name for file in present if file not in files.values()]
-
-
-def _files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
-    """Return the files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them.
-
-    Returns what is ignored as well.
-    """
-    scene = object_from_json_file(path)
-    try:
-        renderer = scene.get("renderer", {})
-        folder = path.parent / renderer.get("output_directory", "")
-        requests = renderer.get("output_buffers", [])
-        files: dict[str, Path] = {}
-        ignored = []
-        later = None
-        for request in requests:
-            quantity, name = request["type"], request.get("hdr_output_file")
-            if quantity not in CHANNELS or not name:
-                ignored.append(f"output buffer {quantity} without hdr_output_file or of unknown type")
-                continue
-            file = with_known_suffix(folder / name, radiance_suffixes(quantity))
-            settings = request.get("two_buffer_variance", False), request.get("sample_variance", False)
-            for suffix in (PLANES[plane] for plane in planes_of_output(*settings)):
-                files[quantity + suffix] = file.with_name(file.stem + suffix + file.suffix)
-        if "color" not in files and renderer.get("hdr_output_file"):
-            picture = with_known_suffix(folder / renderer["hdr_output_file"])
-            if files and not renderer.get("overwrite_output_files", True):
-                later = picture.with_name(f"{picture.stem}001{picture.suffix}")
-            files["color"] = picture
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: expected renderer.output_buffers such as "
-            '[{"type": "color", "hdr_output_file": "color.exr"}]; correct the scene'
-        ) from error
-    if "color" not in files:
-        raise InputError(
-            f'{path}: saves no colour; add {{"type": "color", "hdr_output_file": "color.exr"}} to '
-            "renderer.output_buffers and render"
-        )
-    if later is not None and _is_file(later):
-        # Pictures are numbered, buffers are not: those there are of the last render.
-        raise InputError(
-            f"{path}: expected one picture beside its buffers, found {later.name}, too; keep that of the "
-            f"last render alone, as {files['color'].name}"
-        )
-    for quantity in CHANNELS:
-        noise = [key for suffix in _SUFFIXES[1:] if (key := quantity + suffix) in files]
-        if noise and not any(_is_file(files[key]) for key in noise):
-            # A render of 1 spp has no halves. If some of these files are missing, it was cut short.
-            ignored.append(f"{quantity}: no {', '.join(files.pop(key).name for key in noise)}")
-    missing = [file for file in files.values() if not _is_file(file)]
-    if missing:
-        raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")
-    return files, ignored
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # such as too long a name
-        return False
 
 
 def _from_images(
@@ -423,7 +320,3 @@ def _sizes_differ(label: str, part: Part, color: Part) -> str:
         "bring all to one data window" if part.window[2:] == color.window[2:] else "render all at one size"
     )
     return f"{label}: expected {expected} as the colour has, got {got}; {remedy}"
-
-
-def _names(files: Iterable[Path]) -> str:
-    return ", ".join(file.name for file in files) or "no image"
