@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from tungsten_dip.sequence.following import Models
     from tungsten_dip.sequence.frames import Frame
-    from tungsten_dip.sequence.work import Record
+    from tungsten_dip.sequence.work import Record, Run
 
 _LOG = logging.getLogger(__name__)
 
@@ -72,13 +72,31 @@ _REFIT_HELP = (
 
 
 def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    with deferred_interrupts():
-        from tungsten_dip.sequence.cluster import denoise_on_cluster
-        from tungsten_dip.sequence.following import Models
-        from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
-        from tungsten_dip.sequence.work import Run, denoise_frames
+    frames, run, models = _arguments(options)
+    records, models = _denoised(options, frames, run, models)
+    if options.report is not None:
+        _write_report(options.report, options.input, records)
+    errors = []
+    if options.save_model is not None:
+        try:
+            _save_model(options.save_model, models, records[0])
+        except InputError as error:
+            errors.append(str(error))
+    return _summary(records, errors)
 
-    workers = 1 if options.workers is None else whole_number("--workers", options.workers, 1, MOST_THREADS)
+
+def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
+    """Return the frames, what holds for all of them, and the networks to start from.
+
+    Raises InputError if the options ask for what cannot be done, or for files that cannot be written.
+    """
+    with deferred_interrupts():
+        from tungsten_dip.sequence.following import Models
+        from tungsten_dip.sequence.frames import find_frames, numbers_from_text
+        from tungsten_dip.sequence.work import Run
+
+    if options.workers is not None:
+        whole_number("--workers", options.workers, 1, MOST_THREADS)
     if options.scheduler != "local" and options.workers is not None:
         raise InputError("--workers: these are local processes, a scheduler has its own; omit one of the two")
     if options.scheduler != "local" and "://" not in options.scheduler:
@@ -96,30 +114,35 @@ def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
     run = Run(settings, options.refit, dict(options.map), options.float16, digest)
-    models = Models(first=warm_start)
     _make_writable(frames[0].output.parent, results)
+    return frames, run, Models(first=warm_start)
 
+
+def _denoised(
+    options: argparse.Namespace, frames: list[Frame], run: Run, models: Models
+) -> tuple[list[Record], Models]:
+    """Denoise the frames, here or on workers; return their records and the networks in the end."""
+    with deferred_interrupts():
+        from tungsten_dip.sequence.cluster import denoise_on_cluster
+        from tungsten_dip.sequence.work import denoise_frames
+
+    workers = options.workers or 1
     with _without_repetition(), progress_on_stderr("denoising") as progress:
         if options.scheduler == "local" and workers == 1:
-            records, models = denoise_frames(frames, run, models, progress, _tell)
-        else:
-            records, models = denoise_on_cluster(
-                frames, run, options.scheduler, workers, models, progress, _tell
-            )
-    if options.report is not None:
-        _write_report(options.report, options.input, records)
-    errors = []
+            return denoise_frames(frames, run, models, progress, _tell)
+        return denoise_on_cluster(frames, run, options.scheduler, workers, models, progress, _tell)
+
+
+def _summary(records: list[Record], errors: list[str]) -> tuple[dict[str, Any], str]:
+    """Return what is told in the end; ``errors`` come after that of frames without a result."""
+    from tungsten_dip.sequence.frames import text_from_numbers
+
+    facts: dict[str, Any] = {"frames": [asdict(record) for record in records]}
     failures = [record.number for record in records if record.error is not None]
     if failures:
         rest = "" if len(failures) == len(records) else "; the others are done"
         listed = text_from_numbers(failures)
-        errors.append(f"{len(failures)} of {len(records)} frames have no result: {listed}{rest}")
-    if options.save_model is not None:
-        try:
-            _save_model(options.save_model, models, records[0])
-        except InputError as error:
-            errors.append(str(error))
-    facts: dict[str, Any] = {"frames": [asdict(record) for record in records]}
+        errors = [f"{len(failures)} of {len(records)} frames have no result: {listed}{rest}", *errors]
     if errors:
         facts["error"] = "; ".join(errors)
     done = [record for record in records if not record.skipped and record.error is None]
