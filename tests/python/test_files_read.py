@@ -468,6 +468,16 @@ def test_a_folder_prefers_exr_and_follows_the_map(tmp_path: Path, caplog: pytest
         read_buffers(tmp_path, {"color": "missing.exr"})
 
 
+@pytest.mark.parametrize(
+    ("noisy", "denoised"), [("ViewLayer.Noisy Image", "ViewLayer.Combined"), ("noisy", "RGBA")]
+)
+def test_the_picture_is_what_a_renderer_denoised_itself(tmp_path: Path, noisy: str, denoised: str) -> None:
+    path = tmp_path / "a.exr"
+    channels = save(path, *rgb(noisy), *rgb(denoised), *rgb("ViewLayer.DiffCol"))
+    np.testing.assert_array_equal(read_image(path), np.stack([channels[n] for n in rgb(denoised)], axis=-1))
+    assert holds(read_buffers(path).color, channels, *rgb(noisy))
+
+
 @pytest.mark.parametrize("name", ["noisy", "Noisy Image", "color", "albedo"])
 def test_the_other_parts_of_a_folders_files_are_not_taken_for_its_quantities(
     tmp_path: Path, name: str

@@ -28,6 +28,9 @@ ALIASES = {
 }
 """Layer names of every quantity in lower case, best first. The empty name is the top level."""
 
+_NOISY = ALIASES["color"][:2]
+_SHOWN = ("combined", "rgba")
+
 _THREE_CHANNELS = tuple(quantity for quantity, count in CHANNELS.items() if count == 3)
 
 PLANES = {"mean": "", "half_a": "A", "half_b": "B", "variance": "Variance"}
@@ -111,6 +114,22 @@ def planes_of_output(two_buffer_variance: bool, sample_variance: bool) -> list[s
     """Return the planes that Tungsten writes of a buffer with these settings."""
     halves = ["half_a", "half_b"] if two_buffer_variance else []
     return ["mean", *halves, *(["variance"] if sample_variance else [])]
+
+
+def denoised_layer(channel_names: Iterable[str]) -> str | None:
+    """Return the layer that a renderer's own denoiser made of a noisy one in the same file, if there is one.
+
+    Blender keeps the noisy picture as "Noisy Image" beside "Combined".
+    """
+    layers = {name.rpartition(".")[0] for name in channel_names}
+    by_name = {layer.lower(): layer for layer in layers}
+    shown = [
+        by_name[before + dot + alias]
+        for before, dot, last in (name.rpartition(".") for name in by_name)
+        for alias in _SHOWN
+        if last in _NOISY and before + dot + alias in by_name
+    ]
+    return shown[0] if len(shown) == 1 else None
 
 
 def check_no_chroma(color: Iterable[str], channel_names: Iterable[str]) -> None:

@@ -21,6 +21,7 @@ from tungsten_dip.buffers.layers import (
     PLANES,
     Found,
     check_no_chroma,
+    denoised_layer,
     find_layers,
     mapped_channels,
     names_quantity,
@@ -77,8 +78,8 @@ def _check_mapping(mapping: Any) -> None:
 def read_image(path: str | Path) -> FloatImage:
     """Read the picture that a viewer would show: the top-level R, G, B (or Y) of the first part.
 
-    Where there are none, as in files of Blender, it is the colour that `read_buffers` finds. Returns linear
-    radiance, float32, shape (height, width, 3).
+    Where there are none, as in files of Blender, it is the colour that `read_buffers` finds, or the denoised
+    one beside it (`denoised_layer`). Returns linear radiance, float32, shape (height, width, 3).
 
     Raises InputError if the file is missing, damaged or no image, or if there is no colour.
     """
@@ -87,7 +88,8 @@ def read_image(path: str | Path) -> FloatImage:
     names = next((names for names in ("RGB", "Y") if all(name in channels for name in names)), None)
     if names is None:
         try:
-            return read_buffers(path).color.mean
+            denoised = denoised_layer(channels)
+            return read_buffers(path, {"color": denoised} if denoised else None).color.mean
         except InputError as error:
             found = ", ".join(channels)
             raise InputError(
