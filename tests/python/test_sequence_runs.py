@@ -191,7 +191,7 @@ def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     (frames / "cameras/f0002.json").unlink()
     assert main(arguments("--frames", "0-4")) == 2
     error = capsys.readouterr().err
-    assert "3 of 5 frames have no result: 1-2, 4; the others are done" in error
+    assert "3 of 5 frames without a result: 1-2, 4; the others are done" in error
     assert "Traceback" not in error
     assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
 
@@ -379,7 +379,7 @@ def test_local_workers_do_what_one_does(frames, capsys):
     assert main(arguments("--workers", "2", "--json", "--frames", "0-3,9")) == 2
     assert not (frames / "foreign code").exists()
     err = capsys.readouterr().err
-    assert "1 of 5 frames have no result: 9" in err
+    assert "1 of 5 frames without a result: 9" in err
     assert "frame 9: " in err
     assert len(outputs(frames)) == COUNT
     # All are finished: no worker is needed, and what one process finds is the same.
@@ -479,7 +479,7 @@ def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatc
         n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
     ) as local:
         assert main(arguments("--scheduler", local.scheduler_address)) == 2
-    assert "3 of 4 frames have no result: 1-3; the others are done" in capsys.readouterr().err
+    assert "3 of 4 frames without a result: 1-3; the others are done" in capsys.readouterr().err
     assert list(outputs(frames)) == ["f0000.exr"]
 
 
@@ -508,7 +508,7 @@ def test_no_other_network_is_saved_in_place_of_the_first_frames(frames, capfd, m
     out, err = capfd.readouterr()
     assert len(json.loads(out)["frames"]) == COUNT
     assert err.splitlines()[-1].endswith(
-        "1 of 4 frames have no result: 0; the others are done; m.onnx: not written: frame 0, whose network "
+        "1 of 4 frames without a result: 0; the others are done; m.onnx: not written: frame 0, whose network "
         "it is, has no result"
     )
     assert not Path("m.onnx").exists()
@@ -521,7 +521,7 @@ def test_json_tells_of_the_frames_that_are_done_where_others_are_not(frames, cap
     assert first["error"] is None
     assert "f0009" in other["error"]
     assert "frame 9: " in err
-    assert err.splitlines()[-1].endswith("1 of 2 frames have no result: 9; the others are done")
+    assert err.splitlines()[-1].endswith("1 of 2 frames without a result: 9; the others are done")
 
 
 def test_the_published_method_is_refused_before_a_worker_starts(frames, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,11 +33,28 @@ def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
     add(f"{flag}preset", dest="preset", choices=get_args(Preset), help="how to fit (default: balanced)")
     pilots = get_args(get_type_hints(FitSettings)["pilot"])
     add(f"{flag}pilot", dest="pilot", choices=pilots, help="another denoiser to choose from (default: none)")
-    add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=duration, help="end after 90s, 5m, ...")
-    add(f"{flag}target-error", dest="target_error", metavar="E", type=float, help="end at this relMSE")
+    add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=_budget, help="end after 90s, 5m, ...")
+    add(f"{flag}target-error", dest="target_error", metavar="E", type=_error, help="end at this relMSE")
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")
     add(f"{flag}save-model", dest="save_model", metavar="M.onnx", type=Path, help="save the fitted network")
     add(f"{flag}warm-start", dest="warm_start", metavar="M.onnx", type=Path, help="start from this network")
+
+
+def _budget(text: str) -> float:
+    return _above_zero(text, duration(text))
+
+
+def _error(text: str) -> float:
+    try:
+        return _above_zero(text, float(text))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a relMSE such as 0.003, got '{text}'") from None
+
+
+def _above_zero(text: str, value: float) -> float:
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected more than 0, got '{text}'")
+    return value
 
 
 def add_file_options(parser: argparse._ActionsContainer) -> None:

@@ -142,7 +142,7 @@ def _summary(records: list[Record], errors: list[str]) -> tuple[dict[str, Any], 
     if failures:
         rest = "" if len(failures) == len(records) else "; the others are done"
         listed = text_from_numbers(failures)
-        errors = [f"{len(failures)} of {len(records)} frames have no result: {listed}{rest}", *errors]
+        errors = [f"{len(failures)} of {len(records)} frames without a result: {listed}{rest}", *errors]
     if errors:
         facts["error"] = "; ".join(errors)
     done = [record for record in records if not record.skipped and record.error is None]

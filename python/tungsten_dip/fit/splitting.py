@@ -146,7 +146,7 @@ def _split(image: FloatImage, share: FloatImage) -> Halves:
 
 def _why(buffers: RenderBuffers, test: HalvesTest) -> str:
     if buffers.color.halves is None:
-        return "the image has no half buffers"
+        return "the image has no half buffers that can be used"
     if np.isnan(test.correlation) and np.array_equal(*buffers.color.halves):
         return "the image's half buffers are copies"
     return f"the image's half buffers are not independent (correlation {test.correlation:.2f})"

@@ -175,7 +175,7 @@ def _key(frame: Frame, run: Run) -> str:
         # By their paths: files of two takes may be alike in all else. One that has moved may be another one.
         stats = [(file.stat().st_size, file.stat().st_mtime_ns, str(file.absolute())) for file in files]
     except OSError as error:
-        raise InputError(f"{error.filename}: no such file; render it, or mend the pattern") from error
+        raise InputError(f"{error.filename}: no such file; mend the pattern") from error
     settings = {k: v for k, v in asdict(run.settings).items() if k not in _NOT_OF_THE_IMAGE}
     asked = (settings, run.refit, run.mapping, run.float16, run.warm_start_sha256)
     facts: list[Any] = [stats, *asked, metadata.version("tungsten-dip")]
