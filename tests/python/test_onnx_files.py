@@ -73,12 +73,11 @@ def test_every_model_survives_its_file(
     members: int,
     data: strategies.DataObject,
 ) -> None:
-    reference = data.draw(strategies.integers(1, len(pilots) + candidates))
-    layout = Layout(tuple(features), tuple(pilots), candidates, reference)
+    baseline = data.draw(strategies.integers(1, len(pilots) + candidates))
+    layout = Layout(tuple(features), tuple(pilots), candidates, baseline)
     inputs = len(layout.inputs)
     constants = Standardisation(np.linspace(-9, 9, inputs), np.full(inputs, 0.3, np.float32))
     fit = Model(
-        "pointwise",
         layout.inputs,
         first_weights(layout, seed, members),
         FitSettings("final", seed=seed),

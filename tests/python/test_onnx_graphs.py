@@ -160,7 +160,7 @@ def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> N
     standardisation = Standardisation(mean, np.full(inputs, 0.02, np.float32))
     weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
-    fit = Model("pointwise", layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
+    fit = Model(layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
     choices = rng.random((2, 2, 3, 6, 7), np.float32)
     color = session_of(fit).run(None, {"inputs": raw, "choices": choices})[0]
     standardisation.apply(flat, threads=1)

@@ -106,7 +106,6 @@ def fit_fusion(
         result,
         iterations=training.steps_done,
         model=Model(
-            kind="pointwise",
             inputs=evidence.layout.inputs,
             weights=network.weights(),
             settings=settings,

@@ -16,8 +16,6 @@ from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 
-Kind = Literal["pointwise", "skip", "resnet"]
-
 Weights = dict[str, npt.NDArray[np.float32]]
 """By name. Those of convolutions have shape (outputs, inputs, height, width)."""
 
@@ -26,17 +24,15 @@ Weights = dict[str, npt.NDArray[np.float32]]
 class Model:
     """A fitted network and all that is needed to use it on another image.
 
-    ``kind`` pointwise is the network of the presets draft, balanced and final: it chooses pixel by pixel
-    among the pilots of ``layout``, and its inputs are standardised with constants of the image that it was
-    fitted to. The others are the networks of the preset paper, which give the image themselves; for them
-    ``layout`` and ``standardisation`` are None.
+    That of the presets draft, balanced and final chooses pixel by pixel among the pilots of ``layout``, and
+    its inputs are standardised with constants of the image that it was fitted to. The networks of the preset
+    paper give the image themselves; for them ``layout`` and ``standardisation`` are None.
 
     ``inputs`` names the network's inputs in order. ``estimated_relmse`` is the error of the fit's result.
     ``source_sha256`` is the SHA-256 of the colour that the network was fitted to (float32, row by row),
     ``version`` that of this package.
     """
 
-    kind: Kind
     inputs: tuple[str, ...]
     weights: Weights
     settings: FitSettings
@@ -45,6 +41,11 @@ class Model:
     layout: Layout | None = None
     standardisation: Standardisation | None = None
     version: str = metadata.version("tungsten-dip")
+
+    @property
+    def kind(self) -> Literal["pointwise", "skip", "resnet"]:
+        """What network it is."""
+        return self.settings.network if self.settings.preset == "paper" else "pointwise"
 
 
 def source_sha256(buffers: RenderBuffers) -> str:

@@ -25,7 +25,7 @@ from onnx import TensorProto, numpy_helper
 from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.model import Kind, Model
+from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx.graph import graph_of
@@ -96,7 +96,6 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
     facts: dict[str, Any] = {
         "format": _FORMAT,
         "version": model.version,
-        "kind": model.kind,
         "inputs": model.inputs,
         "settings": {name: getattr(model.settings, name) for name in _SETTINGS},
         "estimated_relmse": model.estimated_relmse,
@@ -203,7 +202,6 @@ def _no_constant(name: str) -> None:
 
 
 def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) -> Model:
-    kind = _checked("kind", facts.get("kind"), Kind)
     chosen = _object("settings", facts.get("settings"))
     hints = get_type_hints(FitSettings)
     settings = FitSettings(**{name: _checked(name, chosen.get(name), hints[name]) for name in _SETTINGS})
@@ -211,7 +209,7 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
     inputs = _checked("inputs", facts.get("inputs"), tuple[str, ...])
     version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))
     layout = standardisation = None
-    if kind == "pointwise":
+    if settings.preset != "paper":
         layout = _layout(_object("layout", facts.get("layout")))
         if layout.inputs != inputs:
             raise InputError("the inputs are not those of the pilots; this version has other names for them")
@@ -219,17 +217,13 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
         if not (std > 0).all():
             raise InputError("std: expected numbers above 0")
         standardisation = Standardisation(mean.ravel(), std.ravel())
-    elif settings.network != kind:
-        raise InputError(f"expected the network {settings.network}, as in the settings, found {kind}")
-    if (settings.preset == "paper") != (kind != "pointwise"):
-        raise InputError(f"expected another network with the preset {settings.preset} than {kind}")
     # Other initializers are constants of the graph, which the comparison of the graphs checks.
     weights = {
         name: _array(tensor, name, "f4")
         for name, tensor in tensors.items()
         if name.endswith((".weight", ".bias"))
     }
-    return Model(kind, inputs, weights, settings, relmse, source, layout, standardisation, version)
+    return Model(inputs, weights, settings, relmse, source, layout, standardisation, version)
 
 
 def _layout(facts: dict[str, Any]) -> Layout:

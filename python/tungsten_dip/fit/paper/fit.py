@@ -194,7 +194,7 @@ def fit_paper(
             if iteration < total:
                 notes.append(f"the time budget ended at iteration {iteration} of {total}")
         color, weights = fit.color(), fit.weights()
-    model = Model(settings.network, images.inputs, weights, settings, None, source_sha256(buffers))
+    model = Model(images.inputs, weights, settings, None, source_sha256(buffers))
     return FitResult(
         color,
         settings,
