@@ -124,10 +124,7 @@ void box_mean(ConstImage in, int radius, Image out, int threads);
 struct HalvesTest {
     // Of the two halves' errors; NaN if this image does not allow measuring it.
     double correlation = std::numeric_limits<double>::quiet_NaN();
-    // The halves' variance over the sample variance, the mean of all pixels; NaN without a sample variance.
-    double variance_ratio = std::numeric_limits<double>::quiet_NaN();
-    std::int64_t pixels_used = 0;  // for the correlation
-    bool independent = false;      // false as well where the correlation is NaN
+    bool independent = false;  // false as well where the correlation is NaN
 };
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);

@@ -84,7 +84,6 @@ double median(std::vector<double>& values) {
 struct Correlation {
     double value = unknown;
     double standard_error = unknown;
-    std::int64_t pixels = 0;
 };
 
 Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
@@ -101,14 +100,11 @@ Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
     // Slivers at the borders hold too few pixels for a ratio.
     std::erase_if(tiles, [](const Tile& tile) { return tile.pixels < tile_size * tile_size / 2; });
 
-    std::int64_t signal_pixels = 0;
-    for (const Tile& tile : tiles) {
-        if (tile.sum > 0) signal_pixels += tile.pixels;
-    }
+    const bool signal = std::ranges::any_of(tiles, [](const Tile& tile) { return tile.sum > 0; });
     std::erase_if(tiles, [](const Tile& tile) { return !(tile.difference > rounding * tile.energy); });
     if (tiles.empty()) {
-        if (signal_pixels == 0) return {};
-        return {.value = 1, .standard_error = 0, .pixels = signal_pixels};  // the halves are one image
+        if (!signal) return {};
+        return {.value = 1, .standard_error = 0};  // the halves are one image
     }
 
     const auto calm_end = tiles.begin() + static_cast<std::ptrdiff_t>((tiles.size() + 1) / 2);
@@ -116,16 +112,11 @@ Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
                      [](const Tile& p, const Tile& q) { return p.calmness() < q.calmness(); });
     tiles.erase(calm_end, tiles.end());
 
-    Correlation result{.value = 0, .standard_error = 0, .pixels = 0};
-    std::vector<double> ratios;
-    for (const Tile& tile : tiles) {
-        ratios.push_back(tile.correlation());
-        result.pixels += tile.pixels;
-    }
-    result.value = median(ratios);
+    std::vector<double> ratios(tiles.size());
+    std::ranges::transform(tiles, ratios.begin(), &Tile::correlation);
     // 1.25 = sqrt(pi / 2): the standard error of a median of normal values over that of their mean.
-    result.standard_error = 1.25 * tile_spread / std::sqrt(static_cast<double>(tiles.size()));
-    return result;
+    return {.value = median(ratios),
+            .standard_error = 1.25 * tile_spread / std::sqrt(static_cast<double>(tiles.size()))};
 }
 
 // --- The halves' variance over the sample variance
@@ -297,8 +288,6 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
     const bool shared = std::isnan(ratio.value) ? correlation.value > agreement
                                                 : ratio.value + 2 * ratio.standard_error < smallest_ratio;
     return {.correlation = correlation.value,
-            .variance_ratio = ratio.value,
-            .pixels_used = correlation.pixels,
             .independent = !std::isnan(correlation.value) && !mirrored && !(alike && shared)};
 }
 

@@ -72,9 +72,6 @@ void independent_halves_pass() {
             const HalvesTest test = compare(*render, with_variance);
             CHECK(test.independent);
             CHECK(std::abs(test.correlation) < 0.1);
-            CHECK(test.pixels_used > 4000);
-            CHECK(std::isnan(test.variance_ratio) || near(test.variance_ratio, 1, 0.1));
-            CHECK(std::isnan(test.variance_ratio) == !with_variance);
         }
     }
 }
@@ -166,16 +163,17 @@ void rounding_is_no_noise() {
 // A half float that holds few of its smallest steps is off by a large part of itself.
 void variances_of_few_steps_tell_nothing() {
     Render render(100, 99, 16, 16, normal);
-    const double dark = std::sqrt(0.7 * 0x1p-24 * 16);  // its variance is 0.7 steps in the mean
+    add_texture(render, 10);
+    const double dark = std::sqrt(0.55 * 0x1p-24 * 16);  // its variance, 0.55 steps in the mean, becomes 1
     for (int y = 0; y < 100; ++y) {
-        for (int x = 0; x < 50; ++x) {
+        for (int x = 0; x < 90; ++x) {
             for (Pixels* half : {&render.half_a, &render.half_b})
                 half->at(y, x) = static_cast<float>(dark * half->at(y, x));
             const double steps = std::round(dark * dark * render.variance.at(y, x) / 0x1p-24);
             render.variance.at(y, x) = static_cast<float>(steps * 0x1p-24);
         }
     }
-    CHECK(near(compare(render, true).variance_ratio, 1, 0.06));
+    CHECK(compare(render, true).independent);  // which the variance of the other pixels shows
 }
 
 void nothing_to_see_is_not_independent() {
@@ -183,10 +181,10 @@ void nothing_to_see_is_not_independent() {
                                         std::pair{0, 5}, std::pair{5, 0}, std::pair{3, 3}}) {
         Render render(height, width, 4, 10, normal);
         const HalvesTest test = compare(render, true);
-        CHECK(!test.independent && std::isnan(test.correlation) && test.pixels_used == 0);
+        CHECK(!test.independent && std::isnan(test.correlation));
     }
     Render flat(50, 50, 4, 11, [](Generator&) { return 0.0; });
-    CHECK(!compare(flat, true).independent && std::isnan(compare(flat, true).variance_ratio));
+    CHECK(!compare(flat, true).independent);
 }
 
 void threads_do_not_matter() {
@@ -194,7 +192,7 @@ void threads_do_not_matter() {
     const auto run = [&](int threads) {
         return compare_halves(render.half_a.view(), render.half_b.view(), render.variance.view(), threads);
     };
-    CHECK(run(1).correlation == run(5).correlation && run(1).variance_ratio == run(5).variance_ratio);
+    CHECK(run(1).correlation == run(5).correlation && run(1).independent == run(5).independent);
 }
 
 }  // namespace
