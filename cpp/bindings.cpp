@@ -4,7 +4,6 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include <algorithm>
 #include <array>
 #include <limits>
 #include <optional>
@@ -33,8 +32,16 @@ std::string described(const py::array& array) {
                 aligned(array) ? "" : ", not aligned");
 }
 
-// Only C++ knows that the data of inputs is not written to: numpy's read-only arrays are welcome.
-Image image_from_array(const std::string& name, const py::array& array) {
+template <typename T>
+ImageView<T> view_of(T* data, const py::array& array) {
+    return {.data = data,
+            .height = static_cast<int>(array.shape(0)),
+            .width = static_cast<int>(array.shape(1)),
+            .channels = static_cast<int>(array.shape(2))};
+}
+
+// Inputs are read alone: numpy's read-only arrays are welcome.
+ConstImage image_from_array(const std::string& name, const py::array& array) {
     const std::string expected =
         name + ": expected an aligned C-contiguous float32 array of shape (height, width, channels), got ";
     if (!py::isinstance<py::array_t<float>>(array)) throw py::type_error(expected + described(array));
@@ -43,18 +50,15 @@ Image image_from_array(const std::string& name, const py::array& array) {
         array.shape(1) > limit || array.shape(2) > limit) {
         throw py::value_error(expected + described(array));
     }
-    return {.data = static_cast<float*>(const_cast<void*>(array.data())),
-            .height = static_cast<int>(array.shape(0)),
-            .width = static_cast<int>(array.shape(1)),
-            .channels = static_cast<int>(array.shape(2))};
+    return view_of(static_cast<const float*>(array.data()), array);
 }
 
 using OptionalArray = std::optional<py::array>;
 
 // Takes an array, if there is one, that is to have the shape of another.
-Image image_in_shape_of(const py::array& other, const std::string& name, const OptionalArray& array) {
+ConstImage image_in_shape_of(const py::array& other, const std::string& name, const OptionalArray& array) {
     if (!array) return {};
-    const Image image = image_from_array(name, *array);
+    const ConstImage image = image_from_array(name, *array);
     if (!array->attr("shape").equal(other.attr("shape"))) {
         throw py::value_error(name + ": expected the shape of the others, " +
                               std::string(py::str(other.attr("shape"))) + ", got " +
@@ -63,15 +67,16 @@ Image image_in_shape_of(const py::array& other, const std::string& name, const O
     return image;
 }
 
-Buffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a, const OptionalArray& half_b,
-                          const OptionalArray& variance) {
+ConstBuffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a,
+                               const OptionalArray& half_b, const OptionalArray& variance) {
     return {.mean = image_from_array("mean", mean),
             .half_a = image_in_shape_of(mean, "half_a", half_a),
             .half_b = image_in_shape_of(mean, "half_b", half_b),
             .variance = image_in_shape_of(mean, "variance", variance)};
 }
 
-Array array_like(const Image& image) { return Array({image.height, image.width, image.channels}); }
+Image view_of(Array& out) { return view_of(out.mutable_data(), out); }
+Array array_like(ConstImage image) { return Array({image.height, image.width, image.channels}); }
 
 // Returns the planes, those with defects as mended copies, and the defects of each.
 py::tuple sanitize(const std::string& quantity_name, const py::array& mean, const OptionalArray& half_a,
@@ -81,26 +86,27 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
         throw py::value_error("quantity: expected color, albedo, normal, depth or visibility, got " +
                               quantity_name);
     }
-    Buffer buffer = buffer_from_arrays(mean, half_a, half_b, variance);
+    const ConstBuffer buffer = buffer_from_arrays(mean, half_a, half_b, variance);
     BufferDefects defects;
     {
         const py::gil_scoped_release release;
         defects = find_defects(buffer, *quantity, threads);
     }
-    const auto copied_if_defective = [](const OptionalArray& array, const Defects& found, Image& image) {
-        if (!array || !found.any()) return py::object(array ? py::object(*array) : py::none());
-        const Array copy = array_like(image);
-        std::copy_n(image.data, image.size(), static_cast<float*>(copy.request().ptr));
-        image.data = static_cast<float*>(copy.request().ptr);
-        return py::object(copy);
+    Buffer mended;
+    const auto copied_if_defective = [](const OptionalArray& array, const Defects& found, Image& view) {
+        if (!array) return py::object(py::none());
+        const py::array plane = found.any() ? py::array(array->attr("copy")()) : *array;
+        // `mend` writes to no plane without defects.
+        view = view_of(static_cast<float*>(const_cast<void*>(plane.data())), plane);
+        return py::object(plane);
     };
-    const py::tuple planes = py::make_tuple(copied_if_defective(mean, defects.mean, buffer.mean),
-                                            copied_if_defective(half_a, defects.half_a, buffer.half_a),
-                                            copied_if_defective(half_b, defects.half_b, buffer.half_b),
-                                            copied_if_defective(variance, defects.variance, buffer.variance));
+    const py::tuple planes = py::make_tuple(copied_if_defective(mean, defects.mean, mended.mean),
+                                            copied_if_defective(half_a, defects.half_a, mended.half_a),
+                                            copied_if_defective(half_b, defects.half_b, mended.half_b),
+                                            copied_if_defective(variance, defects.variance, mended.variance));
     if (defects.any()) {
         const py::gil_scoped_release release;
-        mend(buffer, *quantity);
+        mend(mended, *quantity);
     }
     return py::make_tuple(planes,
                           py::make_tuple(defects.mean, defects.half_a, defects.half_b, defects.variance));
@@ -108,9 +114,9 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
 
 HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_b,
                                  const OptionalArray& variance, int threads) {
-    const Image image_a = image_from_array("half_a", half_a);
-    const Image image_b = image_in_shape_of(half_a, "half_b", half_b);
-    const Image variance_image = image_in_shape_of(half_a, "variance", variance);
+    const ConstImage image_a = image_from_array("half_a", half_a);
+    const ConstImage image_b = image_in_shape_of(half_a, "half_b", half_b);
+    const ConstImage variance_image = image_in_shape_of(half_a, "variance", variance);
     const py::gil_scoped_release release;
     return compare_halves(image_a, image_b, variance_image, threads);
 }
@@ -118,10 +124,13 @@ HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_
 py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_a, const py::array& half_b,
                                    const OptionalArray& variance, int radius, int step, float k,
                                    int threads) {
-    const Buffer in = buffer_from_arrays(mean, half_a, half_b, variance);
-    const std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
-                                      array_like(in.mean)};
-    const Buffer out = buffer_from_arrays(planes[0], planes[1], planes[2], planes[3]);
+    const ConstBuffer in = buffer_from_arrays(mean, half_a, half_b, variance);
+    std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
+                                array_like(in.mean)};
+    const Buffer out{.mean = view_of(planes[0]),
+                     .half_a = view_of(planes[1]),
+                     .half_b = view_of(planes[2]),
+                     .variance = view_of(planes[3])};
     {
         const py::gil_scoped_release release;
         prefilter_feature(in, out, {.radius = radius, .step = step, .k = k}, threads);
@@ -130,9 +139,9 @@ py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_
 }
 
 Array box_mean_array(const py::array& in, int radius, int threads) {
-    const Image image = image_from_array("image", in);
+    const ConstImage image = image_from_array("image", in);
     Array out = array_like(image);
-    const Image out_image = image_from_array("out", out);
+    const Image out_image = view_of(out);
     const py::gil_scoped_release release;
     box_mean(image, radius, out_image, threads);
     return out;
@@ -141,10 +150,10 @@ Array box_mean_array(const py::array& in, int radius, int threads) {
 Array regress_arrays(const py::array& target, const py::array& features, const std::vector<float>& penalty,
                      const OptionalArray& guide, const OptionalArray& guide_variance, int radius, int step,
                      int patch_radius, float k, float ridge, int threads) {
-    const Image target_image = image_from_array("target", target);
-    const Image feature_image = image_from_array("features", features);
-    Image guide_image;
-    Image guide_variance_image;
+    const ConstImage target_image = image_from_array("target", target);
+    const ConstImage feature_image = image_from_array("features", features);
+    ConstImage guide_image;
+    ConstImage guide_variance_image;
     if (guide && guide_variance) {
         guide_image = image_from_array("guide", *guide);
         guide_variance_image = image_from_array("guide_variance", *guide_variance);
@@ -154,7 +163,7 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
     } else if (guide || guide_variance) {
         throw py::value_error("guide and guide_variance: expected both or neither");
     }
-    for (const Image& image : {feature_image, guide_image, guide_variance_image}) {
+    for (const ConstImage& image : {feature_image, guide_image, guide_variance_image}) {
         if (image.known() && (image.height != target_image.height || image.width != target_image.width)) {
             throw py::value_error("expected all images in the size of the target");
         }
@@ -163,7 +172,7 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
         throw py::value_error("penalty: expected one value per feature");
     }
     Array out = array_like(target_image);
-    const Image out_image = image_from_array("out", out);
+    const Image out_image = view_of(out);
     const RegressionWindow window{
         .radius = radius, .step = step, .patch_radius = patch_radius, .k = k, .ridge = ridge};
     const py::gil_scoped_release release;
@@ -173,9 +182,9 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
 }
 
 Array structure_tensor_array(const py::array& features, int threads) {
-    const Image in = image_from_array("features", features);
+    const ConstImage in = image_from_array("features", features);
     Array out({in.height, in.width, 3});
-    const Image out_image = image_from_array("out", out);
+    const Image out_image = view_of(out);
     const py::gil_scoped_release release;
     structure_tensor(in, out_image, threads);
     return out;
@@ -183,13 +192,13 @@ Array structure_tensor_array(const py::array& features, int threads) {
 
 Array smooth_along_edges_array(const py::array& image, const py::array& tensor, float along, float across,
                                int threads) {
-    const Image in = image_from_array("image", image);
-    const Image tensor_image = image_from_array("tensor", tensor);
+    const ConstImage in = image_from_array("image", image);
+    const ConstImage tensor_image = image_from_array("tensor", tensor);
     if (tensor_image.height != in.height || tensor_image.width != in.width || tensor_image.channels != 3) {
         throw py::value_error("expected a structure tensor in the size of the image, with 3 channels");
     }
     Array out = array_like(in);
-    const Image out_image = image_from_array("out", out);
+    const Image out_image = view_of(out);
     const py::gil_scoped_release release;
     smooth_along_edges(in, tensor_image, along, across, out_image, threads);
     return out;

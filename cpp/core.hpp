@@ -44,14 +44,23 @@ using ConstImage = ImageView<const float>;
 
 // One quantity: the mean over all samples, the means of two disjoint halves of them, the variance of the
 // mean. All known images have the same shape.
-struct Buffer {
-    Image mean;
-    Image half_a;
-    Image half_b;
-    Image variance;
+template <typename T>
+struct BufferView {
+    ImageView<T> mean;
+    ImageView<T> half_a;
+    ImageView<T> half_b;
+    ImageView<T> variance;
 
     [[nodiscard]] bool has_halves() const { return half_a.known() && half_b.known(); }
+
+    operator BufferView<const T>() const
+        requires(!std::is_const_v<T>)
+    {
+        return {mean, half_a, half_b, variance};
+    }
 };
+using Buffer = BufferView<float>;
+using ConstBuffer = BufferView<const float>;
 
 enum class Quantity : std::uint8_t { color, albedo, normal, depth, visibility };
 
@@ -97,7 +106,7 @@ struct BufferDefects {
     [[nodiscard]] bool any() const { return mean.any() || half_a.any() || half_b.any() || variance.any(); }
 };
 
-[[nodiscard]] BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads);
+[[nodiscard]] BufferDefects find_defects(const ConstBuffer& buffer, Quantity quantity, int threads);
 
 // Replaces every defect in place; images without defects are not written to.
 // - negative values become 0, and so does an infinite depth: the ray left the scene. Negative radiance of up
@@ -144,7 +153,7 @@ struct SearchWindow {
 // `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
 // after filtering. A value is passed through unchanged where its pixel and those next to it have hardly
 // any noise: their halves differ, and their standard deviations are, by less than a thousandth of it.
-void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads);
+void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, int threads);
 
 // --- regression.cpp
 

@@ -270,7 +270,7 @@ class TileFilter {
 };
 
 // The variance of one half: twice that of the mean, which the halves estimate roughly where it is not known.
-void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
+void estimate_variance_of_half(const ConstBuffer& in, Image out, int threads) {
     ConstImage of_mean = in.variance;
     if (!of_mean.known()) {
         std::vector<float> pixels(static_cast<std::size_t>(out.size()));
@@ -285,7 +285,7 @@ void estimate_variance_of_half(const Buffer& in, Image out, int threads) {
 
 }  // namespace
 
-void prefilter_feature(const Buffer& in, const Buffer& out, SearchWindow window, int threads) {
+void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, int threads) {
     if (window.radius < 0 || window.step < 1 || window.radius % window.step != 0 || !(window.k > 0)) {
         throw std::invalid_argument(
             "expected a radius that is a multiple of the step, no negative one, and k above 0, got " +

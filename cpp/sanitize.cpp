@@ -263,7 +263,7 @@ void mend_variance(const Buffer& buffer, Quantity quantity) {
 
 }  // namespace
 
-BufferDefects find_defects(const Buffer& buffer, Quantity quantity, int threads) {
+BufferDefects find_defects(const ConstBuffer& buffer, Quantity quantity, int threads) {
     const Rules rules = value_rules(quantity);
     return {.mean = find_defects(buffer.mean, rules, threads),
             .half_a = find_defects(buffer.half_a, rules, threads),
