@@ -170,7 +170,7 @@ struct RegressionWindow {
 // Denoises `target` by first-order regression on `features`, fitted anew around every pixel; all predictions
 // that a pixel gets from its neighbours' fits are averaged (Bitterli et al. 2016, section 4; Moon et al.
 // 2014). A neighbour's weight is the non-local means weight of `guide` and its per-pixel `guide_variance`
-// (same shape; without data every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) -
+// (same shape; without channels every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) -
 // feature_c(q))^2). `penalty` has one value per feature. At most 16 features; everything must be finite.
 void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
              ConstImage guide_variance, const RegressionWindow& window, Image out, int threads);

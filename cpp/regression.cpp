@@ -80,16 +80,17 @@ TUNGSTEN_DIP_FASTEST void average_patches(float* distances, int size, int column
     for (int x = 0; x < count; ++x) means[x] = std::max(scale * means[x], 0.0F);
 }
 
-// weights = exp(-distance), to which a row of features adds its distance from another.
-TUNGSTEN_DIP_FASTEST void weigh_row(const float* p, const float* q, std::ptrdiff_t plane,
-                                    const FeatureValues& penalty, int feature_count, int count,
-                                    float* weights) {
-    for (int f = 0; f < feature_count; ++f, p += plane, q += plane) {
+// weights = exp(-distance), to which the features from (y, x) on add their distance from those at an offset.
+TUNGSTEN_DIP_FASTEST void weigh_row(const PaddedPlanes& features, int y, int x, int dy, int dx,
+                                    const FeatureValues& penalty, int count, float* weights) {
+    for (int f = 0; f < features.channels(); ++f) {
         const float scale = penalty[static_cast<std::size_t>(f)];
         if (scale <= 0) continue;
-        for (int x = 0; x < count; ++x) weights[x] += scale * (p[x] - q[x]) * (p[x] - q[x]);
+        const float* p = features.row(f, y) + x;
+        const float* q = features.row(f, y + dy) + x + dx;
+        for (int i = 0; i < count; ++i) weights[i] += scale * (p[i] - q[i]) * (p[i] - q[i]);
     }
-    for (int x = 0; x < count; ++x) weights[x] = exp_minus(std::max(weights[x], 0.0F));
+    for (int i = 0; i < count; ++i) weights[i] = exp_minus(std::max(weights[i], 0.0F));
 }
 
 // What a row of neighbours adds to the normal equations: planes of 1, f, f f' (upper triangle), and per
@@ -263,7 +264,7 @@ class Regression {
                ConstImage guide_variance, const RegressionWindow& window, int threads)
         : window_(window),
           threads_(threads),
-          guided_(guide.known()),
+          guided_(guide.channels > 0),
           target_(target, window.radius, threads),
           features_(features, window.radius, threads),
           guide_(guided_ ? PaddedPlanes(guide, window.radius + window.patch_radius, threads)
@@ -358,9 +359,7 @@ class Regression {
             const int y = tile.y + i;
             if (y + dy < 0 || y + dy >= target_.height()) continue;
             if (!guided_) std::fill_n(weights, tile_width, 0.0F);
-            weigh_row(features_.row(0, y) + tile.x, features_.row(0, y + dy) + tile.x + dx,
-                      features_.plane_size(), penalty_, features_.channels(), rounded_up(tile.width, lanes),
-                      weights);
+            weigh_row(features_, y, tile.x, dy, dx, penalty_, rounded_up(tile.width, lanes), weights);
             const int first = std::clamp(-dx - tile.x, 0, tile.width);
             const int last = std::clamp(target_.width() - dx - tile.x, 0, tile.width);
             std::fill(weights, weights + first, 0.0F);
