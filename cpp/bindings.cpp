@@ -149,7 +149,7 @@ Array box_mean_array(const py::array& in, int radius, int threads) {
 
 Array regress_arrays(const py::array& target, const py::array& features, const std::vector<float>& penalty,
                      const OptionalArray& guide, const OptionalArray& guide_variance, int radius, int step,
-                     int patch_radius, float k, float ridge, int threads) {
+                     float k, int threads) {
     const ConstImage target_image = image_from_array("target", target);
     const ConstImage feature_image = image_from_array("features", features);
     ConstImage guide_image;
@@ -173,11 +173,9 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
     }
     Array out = array_like(target_image);
     const Image out_image = view_of(out);
-    const RegressionWindow window{
-        .radius = radius, .step = step, .patch_radius = patch_radius, .k = k, .ridge = ridge};
     const py::gil_scoped_release release;
-    regress(target_image, feature_image, penalty.data(), guide_image, guide_variance_image, window, out_image,
-            threads);
+    regress(target_image, feature_image, penalty.data(), guide_image, guide_variance_image,
+            {.radius = radius, .step = step, .k = k}, out_image, threads);
     return out;
 }
 
@@ -281,20 +279,19 @@ PYBIND11_MODULE(_core, module) {
         .def_readonly("independent", &HalvesTest::independent);
 
     module.def("sanitize", &sanitize, py::arg("quantity"), py::arg("mean"), py::arg("half_a"),
-               py::arg("half_b"), py::arg("variance"), py::arg("threads") = 0);
+               py::arg("half_b"), py::arg("variance"), py::arg("threads"));
     module.def("compare_halves", &compare_halves_arrays, py::arg("half_a"), py::arg("half_b"),
-               py::arg("variance"), py::arg("threads") = 0);
+               py::arg("variance"), py::arg("threads"));
     module.def("prefilter_feature", &prefilter_feature_arrays, py::arg("mean"), py::arg("half_a"),
-               py::arg("half_b"), py::arg("variance"), py::kw_only(), py::arg("radius") = 5,
-               py::arg("step") = 1, py::arg("k") = 0.5F, py::arg("threads") = 0);
-    module.def("box_mean", &box_mean_array, py::arg("image"), py::arg("radius"), py::arg("threads") = 0);
+               py::arg("half_b"), py::arg("variance"), py::kw_only(), py::arg("radius"), py::arg("step"),
+               py::arg("k"), py::arg("threads"));
+    module.def("box_mean", &box_mean_array, py::arg("image"), py::arg("radius"), py::arg("threads"));
     module.def("regress", &regress_arrays, py::arg("target"), py::arg("features"), py::arg("penalty"),
                py::arg("guide") = py::none(), py::arg("guide_variance") = py::none(), py::kw_only(),
-               py::arg("radius"), py::arg("step") = 1, py::arg("patch_radius") = 1, py::arg("k") = 1.0F,
-               py::arg("ridge") = 1e-3F, py::arg("threads") = 0);
-    module.def("structure_tensor", &structure_tensor_array, py::arg("features"), py::arg("threads") = 0);
+               py::arg("radius"), py::arg("step"), py::arg("k") = 1.0F, py::arg("threads"));
+    module.def("structure_tensor", &structure_tensor_array, py::arg("features"), py::arg("threads"));
     module.def("smooth_along_edges", &smooth_along_edges_array, py::arg("image"), py::arg("tensor"),
-               py::kw_only(), py::arg("along"), py::arg("across"), py::arg("threads") = 0);
+               py::kw_only(), py::arg("along"), py::arg("across"), py::arg("threads"));
     module.def("norm_act", &norm_act_arrays, py::arg("x").noconvert(), py::arg("weight").noconvert(),
                py::arg("bias").noconvert(), py::arg("epsilon"), py::arg("slope"));
     module.def("norm_act_gradient", &norm_act_gradient_arrays, py::arg("gradient").noconvert(),

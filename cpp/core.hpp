@@ -2,7 +2,7 @@
 // filters of features and pilots, and a layer of the published networks. Free of Python and of any renderer.
 //
 // Images are float32, C-contiguous, shape (height, width, channels), row 0 at the top; colour is linear
-// radiance. `threads` 0 uses every core; no result depends on it, to the bit.
+// radiance. `threads` is how many threads work, 1 at least; no result depends on it, to the bit.
 #pragma once
 
 #include <algorithm>
@@ -78,8 +78,8 @@ constexpr std::optional<Quantity> quantity_from_name(std::string_view name) {
     return static_cast<Quantity>(found - quantity_names.begin());
 }
 
-// Calls body(0) ... body(count - 1), in any order, from several threads. The first exception is thrown again
-// here.
+// Calls body(0) ... body(count - 1), in any order, on up to `threads` threads. The first exception is thrown
+// again here.
 void parallel_for(int count, int threads, const std::function<void(int)>& body);
 
 // --- sanitize.cpp
@@ -138,15 +138,15 @@ struct HalvesTest {
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);
 
-// --- prefilter.cpp
-
-// Where non-local means looks for pixels that are alike, in every `step`-th row and column up to `radius`
-// away, a multiple of it, and how many standard deviations apart those may be.
+// Where a filter looks for pixels that are alike, in every `step`-th row and column up to `radius` away, a
+// multiple of it, and how many standard deviations of their noise apart those may be.
 struct SearchWindow {
-    int radius = 5;
-    int step = 1;
-    float k = 0.5F;
+    int radius;
+    int step;
+    float k;
 };
+
+// --- prefilter.cpp
 
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
@@ -157,23 +157,14 @@ void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow wi
 
 // --- regression.cpp
 
-// How a pixel's neighbours are chosen and weighted in a local regression.
-struct RegressionWindow {
-    int radius = 9;        // pixels to each side
-    int step = 1;          // a fit looks at every step-th pixel of a row and column; above 1, predictions are
-                           // gathered from every (step + 1)-th
-    int patch_radius = 1;  // the guide is compared in patches of this radius
-    float k = 1;           // how many standard deviations of the guide's noise count as equal
-    float ridge = 1e-3F;   // added to the variance of every feature: keeps flat ones from explaining noise
-};
-
 // Denoises `target` by first-order regression on `features`, fitted anew around every pixel; all predictions
 // that a pixel gets from its neighbours' fits are averaged (Bitterli et al. 2016, section 4; Moon et al.
-// 2014). A neighbour's weight is the non-local means weight of `guide` and its per-pixel `guide_variance`
-// (same shape; without channels every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) -
-// feature_c(q))^2). `penalty` has one value per feature. At most 16 features; everything must be finite.
+// 2014); with a window's step above 1, those in every (step + 1)-th row and column. A neighbour's weight is
+// the non-local means weight of `guide` and its per-pixel `guide_variance` (same shape; without channels
+// every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) - feature_c(q))^2). `penalty` has
+// one value per feature. At most 16 features; everything must be finite.
 void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
-             ConstImage guide_variance, const RegressionWindow& window, Image out, int threads);
+             ConstImage guide_variance, SearchWindow window, Image out, int threads);
 
 // --- steering.cpp
 

@@ -3,6 +3,8 @@
 #include <atomic>
 #include <exception>
 #include <mutex>
+#include <stdexcept>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -11,8 +13,11 @@
 namespace tungsten_dip {
 
 void parallel_for(int count, int threads, const std::function<void(int)>& body) {
-    if (threads <= 0) threads = static_cast<int>(std::thread::hardware_concurrency());
-    threads = std::clamp(threads, 1, std::max(count, 1));
+    if (threads < 1) {
+        throw std::invalid_argument("threads: expected a whole number from 1 on, got " +
+                                    std::to_string(threads));
+    }
+    threads = std::min(threads, count);
 
     std::atomic<int> next = 0;
     std::exception_ptr error;

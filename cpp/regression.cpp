@@ -30,6 +30,13 @@ constexpr int max_features = 16;
 constexpr float least_variance = 1e-8F;
 constexpr float least_weight_sum = 1e-20F;
 
+// The guide is compared in patches of this radius.
+constexpr int patch_radius = 1;
+constexpr int patch_size = 2 * patch_radius + 1;
+
+// Added to the variance of every feature: keeps flat ones from explaining noise.
+constexpr double ridge = 1e-3F;
+
 struct Tile {
     int y;
     int x;
@@ -66,17 +73,17 @@ TUNGSTEN_DIP_FASTEST void compare_rows(const float* p, const float* q, const flo
     }
 }
 
-// means[x] = the mean of the `size` x `size` distances from distances[x] on, but never negative. Leaves sums
-// of columns in the first row of the distances.
-TUNGSTEN_DIP_FASTEST void average_patches(float* distances, int size, int columns, int count, float* means) {
-    for (int row = 1; row < size; ++row) {
+// means[x] = the mean of the patch of distances from distances[x] on, but never negative. Leaves sums of
+// columns in the first row of the distances.
+TUNGSTEN_DIP_FASTEST void average_patches(float* distances, int columns, int count, float* means) {
+    for (int row = 1; row < patch_size; ++row) {
         for (int x = 0; x < columns; ++x) distances[x] += distances[row * columns + x];
     }
     std::fill_n(means, count, 0.0F);
-    for (int column = 0; column < size; ++column) {
+    for (int column = 0; column < patch_size; ++column) {
         for (int x = 0; x < count; ++x) means[x] += distances[x + column];
     }
-    const float scale = 1.0F / static_cast<float>(size * size);
+    const float scale = 1.0F / static_cast<float>(patch_size * patch_size);
     for (int x = 0; x < count; ++x) means[x] = std::max(scale * means[x], 0.0F);
 }
 
@@ -178,7 +185,7 @@ using Equations = std::array<std::array<Systems, max_features>, max_features + c
 
 // Solves by Cholesky's factors, A = L L'. The factorisation takes the rows of the colours through the
 // forward substitution as if they belonged to the matrix.
-TUNGSTEN_DIP_FASTEST void solve(std::size_t n, double ridge, Equations& a) {
+TUNGSTEN_DIP_FASTEST void solve(std::size_t n, Equations& a) {
     for (std::size_t m = 0; m < n; ++m) {
         Systems& pivot = a[m][m];
         // No pivot is less than the ridge, but for rounding.
@@ -200,7 +207,7 @@ TUNGSTEN_DIP_FASTEST void solve(std::size_t n, double ridge, Equations& a) {
 // tile_width apart. Writes, in planes, what the fit says at the pixel itself and its slopes, for every
 // colour.
 TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& features,
-                                     const FeatureValues& origin, std::size_t n, double ridge, int count,
+                                     const FeatureValues& origin, std::size_t n, int count,
                                      float* coefficients, std::ptrdiff_t plane) {
     Equations a;                             // NOLINT(*-member-init): filled below
     std::array<Systems, max_features> mean;  // NOLINT(*-member-init)
@@ -227,7 +234,7 @@ TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& featu
             a[n + c][f] -= mean[f] * constant[c];
         }
     }
-    solve(n, ridge, a);
+    solve(n, a);
     const auto write = [&](const Systems& values) {
         for (int s = 0; s < count; ++s) coefficients[s] = static_cast<float>(values[s]);
         coefficients += plane;
@@ -261,15 +268,15 @@ TUNGSTEN_DIP_FASTEST void predict_row(const float* sums, const FeatureRows& feat
 class Regression {
   public:
     Regression(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
-               ConstImage guide_variance, const RegressionWindow& window, int threads)
+               ConstImage guide_variance, SearchWindow window, int threads)
         : window_(window),
           threads_(threads),
           guided_(guide.channels > 0),
           target_(target, window.radius, threads),
           features_(features, window.radius, threads),
-          guide_(guided_ ? PaddedPlanes(guide, window.radius + window.patch_radius, threads)
+          guide_(guided_ ? PaddedPlanes(guide, window.radius + patch_radius, threads)
                          : PaddedPlanes(0, 0, 0, 0)),
-          guide_variance_(guided_ ? PaddedPlanes(guide_variance, window.radius + window.patch_radius, threads)
+          guide_variance_(guided_ ? PaddedPlanes(guide_variance, window.radius + patch_radius, threads)
                                   : PaddedPlanes(0, 0, 0, 0)),
           coefficients_(colors * (features.channels + 1), target.height, target.width, window.radius) {
         std::copy_n(penalty, features.channels, penalty_.begin());
@@ -370,21 +377,20 @@ class Regression {
     // The guide's distances at one offset, averaged over patches.
     void compare_guide(const Tile& tile, int dy, int dx, Scratch& scratch, float* distances,
                        std::ptrdiff_t distances_of_row) const {
-        const int r = window_.patch_radius;
-        const int rows = tile.height + 2 * r;
-        const int columns = rounded_up(tile.width + 2 * r, lanes);
+        const int rows = tile.height + 2 * patch_radius;
+        const int columns = rounded_up(tile.width + 2 * patch_radius, lanes);
         scratch.distances.resize(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns));
         float* row = scratch.distances.data();
-        for (int y = tile.y - r; y < tile.y + tile.height + r; ++y, row += columns) {
-            const std::ptrdiff_t p = tile.x - r;
+        for (int y = tile.y - patch_radius; y < tile.y + tile.height + patch_radius; ++y, row += columns) {
+            const std::ptrdiff_t p = tile.x - patch_radius;
             const std::ptrdiff_t q = p + dx;
             compare_rows(guide_.row(0, y) + p, guide_.row(0, y + dy) + q, guide_variance_.row(0, y) + p,
                          guide_variance_.row(0, y + dy) + q, guide_.plane_size(), guide_.channels(),
                          window_.k * window_.k, columns, row);
         }
         for (int i = 0; i < tile.height; ++i) {
-            average_patches(scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns, 2 * r + 1,
-                            columns, tile.width, distances + i * distances_of_row);
+            average_patches(scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns, columns,
+                            tile.width, distances + i * distances_of_row);
         }
     }
 
@@ -414,13 +420,12 @@ class Regression {
                                        {target_.row(0, y) + x, target_.row(1, y) + x, target_.row(2, y) + x},
                                        count, stride, planes);
                     });
-        const double ridge = std::max(static_cast<double>(window_.ridge), 1e-12);
         for (int i = 0; i < tile.height; ++i) {
             for (int j = 0; j < tile.width; j += systems) {
                 const int y = tile.y + i;
                 const int x = tile.x + j;
                 fit_pixels(scratch.sums_of_row(i) + j, feature_rows(y, x), origin,
-                           static_cast<std::size_t>(n), ridge, std::min(systems, tile.width - j),
+                           static_cast<std::size_t>(n), std::min(systems, tile.width - j),
                            coefficients_.row(0, y) + x, coefficients_.plane_size());
             }
         }
@@ -451,7 +456,7 @@ class Regression {
         }
     }
 
-    RegressionWindow window_;
+    SearchWindow window_;
     FeatureValues penalty_{};
     int threads_;
     bool guided_;
@@ -465,15 +470,13 @@ class Regression {
 }  // namespace
 
 void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
-             ConstImage guide_variance, const RegressionWindow& window, Image out, int threads) {
+             ConstImage guide_variance, SearchWindow window, Image out, int threads) {
     if (features.channels > max_features) throw std::invalid_argument("at most 16 features");
     if (target.channels != colors) throw std::invalid_argument("the target must have 3 channels");
-    if (window.radius < 0 || window.step < 1 || window.radius % window.step != 0 || window.patch_radius < 0) {
-        throw std::invalid_argument(
-            "the window's radius must be a multiple of its step, and no radius negative");
+    if (window.radius < 0 || window.step < 1 || window.radius % window.step != 0) {
+        throw std::invalid_argument("the window's radius must be a multiple of its step, and not negative");
     }
-    if (!(window.k > 0) || !(window.ridge >= 0))
-        throw std::invalid_argument("k must be above 0, and the ridge not negative");
+    if (!(window.k > 0)) throw std::invalid_argument("k must be above 0");
     const auto valid = [](float value) { return value >= 0 && std::isfinite(value); };
     if (!std::all_of(penalty, penalty + features.channels, valid))
         throw std::invalid_argument("penalties must be finite, and none negative");

@@ -2,8 +2,8 @@
 
 Every function raises TypeError for arrays of another dtype (those of bfloat16 for another layout, too), and
 ValueError for another shape or layout or a number out of range. Nothing is converted. Inputs are read in
-place, also read-only ones. The interpreter lock is released during long work. ``threads`` 0 uses every core;
-no result depends on it.
+place, also read-only ones. The interpreter lock is released during long work. ``threads`` is 1 at least (see
+`cores.thread_count`); no result depends on it.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def sanitize(
     half_a: FloatImage | None,
     half_b: FloatImage | None,
     variance: FloatImage | None,
-    threads: int = 0,
+    threads: int,
 ) -> tuple[
     tuple[FloatImage, FloatImage | None, FloatImage | None, FloatImage | None],
     tuple[Defects, Defects, Defects, Defects],
@@ -53,7 +53,7 @@ def sanitize(
     """Return (mean, half_a, half_b, variance), copied and mended if defective, and all defects."""
 
 def compare_halves(
-    half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int = 0
+    half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int
 ) -> HalvesTest:
     """Test the halves of a colour for independence."""
 
@@ -63,14 +63,14 @@ def prefilter_feature(
     half_b: FloatImage,
     variance: FloatImage | None,
     *,
-    radius: int = 5,
-    step: int = 1,
-    k: float = 0.5,
-    threads: int = 0,
+    radius: int,
+    step: int,
+    k: float,
+    threads: int,
 ) -> tuple[FloatImage, FloatImage, FloatImage, FloatImage]:
     """Return the cross-filtered (mean, half_a, half_b) of a feature and the variance that remains."""
 
-def box_mean(image: FloatImage, radius: int, threads: int = 0) -> FloatImage:
+def box_mean(image: FloatImage, radius: int, threads: int) -> FloatImage:
     """Return the mean over (2 radius + 1)^2 pixels around every pixel, clipped at the borders."""
 
 def regress(
@@ -81,11 +81,9 @@ def regress(
     guide_variance: FloatImage | None = None,
     *,
     radius: int,
-    step: int = 1,
-    patch_radius: int = 1,
-    k: float = 1.0,
-    ridge: float = 1e-3,
-    threads: int = 0,
+    step: int,
+    k: float = ...,
+    threads: int,
 ) -> FloatImage:
     """Return ``target`` (3 channels) denoised by first-order regression on ``features`` in local windows.
 
@@ -94,11 +92,11 @@ def regress(
     At most 16 features; everything must be finite. See ``regress`` in core.hpp.
     """
 
-def structure_tensor(features: FloatImage, threads: int = 0) -> FloatImage:
+def structure_tensor(features: FloatImage, threads: int) -> FloatImage:
     """Return the products xx, yy, xy of the features' gradients, summed, smoothed: (height, width, 3)."""
 
 def smooth_along_edges(
-    image: FloatImage, tensor: FloatImage, *, along: float, across: float, threads: int = 0
+    image: FloatImage, tensor: FloatImage, *, along: float, across: float, threads: int
 ) -> FloatImage:
     """Return ``image``, averaged by a Gaussian that follows the edges of a `structure_tensor`.
 

@@ -1,4 +1,4 @@
-// The parallel loop: every index once, exceptions reach the caller.
+// The parallel loop: every index once, exceptions reach the caller, no threads are refused.
 #include <atomic>
 #include <stdexcept>
 #include <string>
@@ -10,7 +10,7 @@
 using tungsten_dip::parallel_for;
 
 int main() {
-    for (const int threads : {0, 1, 2, 7}) {
+    for (const int threads : {1, 2, 7}) {
         for (const int count : {0, 1, 2, 100}) {
             std::vector<std::atomic<int>> visits(static_cast<std::size_t>(count));
             parallel_for(count, threads, [&](int i) { ++visits[static_cast<std::size_t>(i)]; });
@@ -27,6 +27,15 @@ int main() {
             caught = std::string(error.what()) == "three";
         }
         CHECK(caught);
+    }
+    for (const int threads : {0, -1}) {
+        bool refused = false;
+        try {
+            parallel_for(10, threads, [](int) {});
+        } catch (const std::invalid_argument&) {
+            refused = true;
+        }
+        CHECK(refused);
     }
     return failed_checks();
 }

@@ -12,10 +12,12 @@ using namespace tungsten_dip;
 
 namespace {
 
+constexpr SearchWindow nearby{.radius = 5, .step = 1, .k = 0.5F};
+
 struct Output {
     Pixels mean, half_a, half_b, variance;
 
-    Output(Render& render, int threads, bool with_variance = true, SearchWindow window = {})
+    Output(Render& render, int threads, bool with_variance = true, SearchWindow window = nearby)
         : mean(render.mean), half_a(mean), half_b(mean), variance(mean) {
         Buffer in = render.buffer();
         if (!with_variance) in.variance = {};
@@ -82,7 +84,7 @@ void agrees_with_the_definition() {
     for (const auto& [height, width] :
          {std::pair{13, 11}, std::pair{70, 67}, std::pair{1, 9}, std::pair{9, 1}}) {
         for (const SearchWindow window :
-             {SearchWindow{}, SearchWindow{.radius = 2, .k = 0.9F}, SearchWindow{.radius = 6, .step = 3}}) {
+             {nearby, {.radius = 2, .step = 1, .k = 0.9F}, {.radius = 6, .step = 3, .k = 0.5F}}) {
             Render render = noisy_edge(height, width, 1);
             Output out(render, 2, true, window);
             double worst = 0;
@@ -109,7 +111,7 @@ double squared_error(Pixels& image) {
 void removes_noise_and_keeps_edges() {
     for (const bool with_variance : {true, false}) {
         Render render = noisy_edge(40, 51, 2);
-        Output out(render, 0, with_variance);
+        Output out(render, 2, with_variance);
         CHECK(squared_error(out.mean) < 0.2 * squared_error(render.mean));
         CHECK(near(out.mean.at(20, 24), 1, 0.15) && near(out.mean.at(20, 25), 2, 0.15));
         double remaining = 0;

@@ -40,9 +40,9 @@ def _noisy_color(height: int, width: int, spp: int = 8, mirror: float = 0.0, see
 
 
 CALLS: list[Callable[[np.ndarray], object]] = [
-    lambda array: _core.sanitize("color", array, None, None, None),
-    lambda array: _core.compare_halves(array, array, None),
-    lambda array: _core.prefilter_feature(array, array, array, None),
+    lambda array: _core.sanitize("color", array, None, None, None, 2),
+    lambda array: _core.compare_halves(array, array, None, 2),
+    lambda array: _core.prefilter_feature(array, array, array, None, radius=5, step=1, k=0.5, threads=2),
 ]
 
 
@@ -82,13 +82,13 @@ def test_shapes_must_agree() -> None:
     with pytest.raises(
         ValueError, match=r"half_b: expected the shape of the others, \(4, 5, 3\), got \(5, 4, 3\)"
     ):
-        _core.compare_halves(image, other, None)
+        _core.compare_halves(image, other, None, 2)
     with pytest.raises(ValueError, match="variance: expected the shape"):
-        _core.compare_halves(image, image, other)
+        _core.compare_halves(image, image, other, 2)
     with pytest.raises(TypeError, match=r"^half_a: expected an aligned"):
-        _core.compare_halves(image.astype(np.float64), image, None)  # type: ignore[arg-type]
+        _core.compare_halves(image.astype(np.float64), image, None, 2)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="quantity: expected color, albedo"):
-        _core.sanitize("colour", image, None, None, None)
+        _core.sanitize("colour", image, None, None, None, 2)
 
 
 def test_the_gradient_of_a_norm_takes_images_of_one_shape_alone() -> None:
@@ -270,7 +270,9 @@ def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:
     albedo = Buffer((half_a + half_b) / 2, half_a, half_b, samples.var(axis=0, ddof=1) / 4)
     filtered = prefilter_features(RenderBuffers(albedo, albedo=albedo)).albedo
     assert filtered is not None
-    one_pass = _core.prefilter_feature(albedo.mean, half_a, half_b, albedo.variance)[0]
+    one_pass = _core.prefilter_feature(
+        albedo.mean, half_a, half_b, albedo.variance, radius=5, step=1, k=0.5, threads=2
+    )[0]
     error, error_of_one = (float(np.mean((image - 0.5) ** 2)) for image in (filtered.mean, one_pass))
     assert error < 0.5 * error_of_one
     assert error_of_one < 0.1 * float(np.mean((albedo.mean - 0.5) ** 2))
@@ -284,8 +286,13 @@ def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
 
 
+def test_without_threads_nothing_is_done() -> None:
+    with pytest.raises(ValueError, match="threads: expected a whole number from 1 on, got 0"):
+        _core.box_mean(np.ones((3, 3, 1), np.float32), 1, 0)
+
+
 def _smoothed(
-    image: FloatImage, features: FloatImage, along: float, across: float, threads: int = 0
+    image: FloatImage, features: FloatImage, along: float, across: float, threads: int = 2
 ) -> FloatImage:
     tensor = _core.structure_tensor(features, threads)
     return _core.smooth_along_edges(image, tensor, along=along, across=across, threads=threads)
@@ -295,7 +302,7 @@ def _smoothed(
 def test_the_structure_tensor_of_a_slope_is_the_product_of_its_gradients(angle: float) -> None:
     rows, columns = np.indices((41, 43), np.float32)
     slope = (2 * np.cos(angle) * columns + 2 * np.sin(angle) * rows)[:, :, None].astype(np.float32)
-    tensor = _core.structure_tensor(np.concatenate((slope, slope), axis=2))
+    tensor = _core.structure_tensor(np.concatenate((slope, slope), axis=2), 2)
     expected = 8 * np.array([np.cos(angle) ** 2, np.sin(angle) ** 2, np.cos(angle) * np.sin(angle)])
     inner = tensor[10:-10, 10:-10]
     # The derivative's kernel is cut off at 3 pixels.
@@ -335,8 +342,8 @@ def test_smoothing_along_edges_is_what_it_is_defined_as(size: tuple[int, int], f
     # Where all edges of a block have one direction, most of its neighbours are left out.
     guide = rng.random((*size, 2), np.float32) if features == "noise" else 0 * image
     guide[:, 3::16] = 1
-    tensor = _core.structure_tensor(guide)
-    smooth = _core.smooth_along_edges(image, tensor, along=3, across=0.5)
+    tensor = _core.structure_tensor(guide, 2)
+    smooth = _core.smooth_along_edges(image, tensor, along=3, across=0.5, threads=2)
     np.testing.assert_allclose(smooth, _smoothed_plainly(image, tensor, 3, 0.5), atol=2e-5)
 
 
@@ -401,7 +408,7 @@ def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
     image = np.ones((4, 5, 3), np.float32)
     for tensor in (image[:3].copy(), image[:, :, :1].copy()):
         with pytest.raises(ValueError, match="in the size of the image, with 3 channels"):
-            _core.smooth_along_edges(image, tensor, along=3, across=0.3)
+            _core.smooth_along_edges(image, tensor, along=3, across=0.3, threads=2)
     with pytest.raises(ValueError, match="above 0"):
         _smoothed(image, image, along=0, across=0.3)
 
@@ -412,4 +419,6 @@ def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
 def test_a_window_that_cannot_be_searched_is_refused(window):
     image = np.ones((4, 5, 3), np.float32)
     with pytest.raises(ValueError, match="expected a radius that is a multiple of the step"):
-        _core.prefilter_feature(image, image, image, None, **window)
+        _core.prefilter_feature(
+            image, image, image, None, **{"radius": 5, "step": 1, "k": 0.5, **window}, threads=2
+        )
