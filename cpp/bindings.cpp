@@ -5,7 +5,6 @@
 #include <pybind11/stl.h>
 
 #include <array>
-#include <limits>
 #include <optional>
 #include <string>
 #include <utility>
@@ -42,10 +41,11 @@ ImageView<T> view_of(T* data, const py::array& array) {
 
 // Inputs are read alone: numpy's read-only arrays are welcome.
 ConstImage image_from_array(const std::string& name, const py::array& array) {
+    constexpr py::ssize_t limit = 1'000'000;  // far from where a coordinate and a radius overflow
     const std::string expected =
-        name + ": expected an aligned C-contiguous float32 array of shape (height, width, channels), got ";
+        name + ": expected an aligned C-contiguous float32 array of shape (height, width, channels), up to " +
+        std::to_string(limit) + " each, got ";
     if (!py::isinstance<py::array_t<float>>(array)) throw py::type_error(expected + described(array));
-    constexpr py::ssize_t limit = std::numeric_limits<int>::max();
     if (array.ndim() != 3 || !contiguous(array) || !aligned(array) || array.shape(0) > limit ||
         array.shape(1) > limit || array.shape(2) > limit) {
         throw py::value_error(expected + described(array));

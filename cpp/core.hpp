@@ -138,12 +138,21 @@ struct HalvesTest {
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);
 
+// --- search_window.cpp
+
+// How far filters may look, in pixels: further than any needs to, and images with so wide a border repeated
+// around them still fit into memory.
+constexpr int max_radius = 256;
+
 // Where a filter looks for pixels that are alike, in every `step`-th row and column up to `radius` away, a
 // multiple of it, and how many standard deviations of their noise apart those may be.
 struct SearchWindow {
     int radius;
     int step;
     float k;
+
+    // Throws std::invalid_argument unless it can be searched.
+    void check() const;
 };
 
 // --- prefilter.cpp
@@ -173,7 +182,7 @@ void regress(ConstImage target, ConstImage features, const float* penalty, Const
 void structure_tensor(ConstImage features, Image out, int threads);
 
 // Averages an image along the edges of a structure tensor of its size: around every pixel by a Gaussian with
-// standard deviations `along` and `across` (in pixels) the edge (Feng and Milanfar 2002, "Multiscale
+// standard deviations `along` and `across` (0.01 to 128 pixels) the edge (Feng and Milanfar 2002, "Multiscale
 // principal components analysis for image local orientation estimation"; Takeda et al. 2007, "Kernel
 // Regression for Image Processing and Reconstruction"). Neighbours with another tensor, as beyond the end of
 // the edge, weigh less.

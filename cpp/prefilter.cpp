@@ -6,8 +6,6 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
-#include <stdexcept>
-#include <string>
 #include <vector>
 
 #include "core.hpp"
@@ -286,12 +284,7 @@ void estimate_variance_of_half(const ConstBuffer& in, Image out, int threads) {
 }  // namespace
 
 void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, int threads) {
-    if (window.radius < 0 || window.step < 1 || window.radius % window.step != 0 || !(window.k > 0)) {
-        throw std::invalid_argument(
-            "expected a radius that is a multiple of the step, no negative one, and k above 0, got " +
-            std::to_string(window.radius) + ", " + std::to_string(window.step) + " and " +
-            std::to_string(window.k));
-    }
+    window.check();
     if (in.mean.size() == 0) return;
     estimate_variance_of_half(in, out.variance, threads);
     const int margin = window.radius + patch_radius;

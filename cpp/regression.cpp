@@ -473,10 +473,7 @@ void regress(ConstImage target, ConstImage features, const float* penalty, Const
              ConstImage guide_variance, SearchWindow window, Image out, int threads) {
     if (features.channels > max_features) throw std::invalid_argument("at most 16 features");
     if (target.channels != colors) throw std::invalid_argument("the target must have 3 channels");
-    if (window.radius < 0 || window.step < 1 || window.radius % window.step != 0) {
-        throw std::invalid_argument("the window's radius must be a multiple of its step, and not negative");
-    }
-    if (!(window.k > 0)) throw std::invalid_argument("k must be above 0");
+    window.check();
     const auto valid = [](float value) { return value >= 0 && std::isfinite(value); };
     if (!std::all_of(penalty, penalty + features.channels, valid))
         throw std::invalid_argument("penalties must be finite, and none negative");

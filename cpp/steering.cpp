@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "core.hpp"
@@ -23,6 +24,9 @@ constexpr int tensor_radius = 6;
 
 // Standard deviations beyond which neighbours are not looked at.
 constexpr float reach = 2.0F;
+// Narrower Gaussians leave nothing of any neighbour either, but their squares may be 0.
+constexpr float least_sigma = 0.01F;
+constexpr float largest_sigma = max_radius / reach;
 
 constexpr float least_trace = 1e-12F;
 
@@ -95,7 +99,7 @@ struct TensorRow {
 
 // What the Gaussians of some pixels in a row are made of: the unit vectors across the edges, 1 / (2 sigma^2)
 // along them, and the penalty of differences between tensors. No weight further away than `columns` and
-// `rows` pixels counts.
+// `rows` pixels, a radius at most, counts.
 struct Gaussians {
     int count;
     int columns = 0;
@@ -106,7 +110,8 @@ struct Gaussians {
     std::array<float, block_width> penalty{};
 
     // Where there is no single direction, as at corners, a Gaussian shrinks to the width that it has across.
-    Gaussians(const TensorRow& tensor, int pixels, float along_sigma, float across_sigma) : count(pixels) {
+    Gaussians(const TensorRow& tensor, int pixels, float along_sigma, float across_sigma, int radius)
+        : count(pixels) {
         float squared_columns = 0;
         float squared_rows = 0;
         for (int x = 0; x < count; ++x) {
@@ -129,8 +134,12 @@ struct Gaussians {
             squared_columns = std::max(squared_columns, short_axis * cosine + long_axis * (1 - cosine));
             squared_rows = std::max(squared_rows, short_axis * (1 - cosine) + long_axis * cosine);
         }
-        columns = static_cast<int>(std::ceil(std::sqrt(squared_columns)));
-        rows = static_cast<int>(std::ceil(std::sqrt(squared_rows)));
+        // Infinite where the tensor's squares are.
+        const auto within_radius = [&](float length) {
+            return static_cast<int>(std::min(std::ceil(length), static_cast<float>(radius)));
+        };
+        columns = within_radius(std::sqrt(squared_columns));
+        rows = within_radius(std::sqrt(squared_rows));
     }
 };
 
@@ -241,7 +250,11 @@ void structure_tensor(ConstImage features, Image out, int threads) {
 
 void smooth_along_edges(ConstImage image, ConstImage tensor_image, float along, float across, Image out,
                         int threads) {
-    if (!(along > 0) || !(across > 0)) throw std::invalid_argument("along and across must be above 0");
+    for (const float sigma : {along, across}) {
+        if (sigma >= least_sigma && sigma <= largest_sigma) continue;
+        throw std::invalid_argument("along and across: expected " + std::to_string(least_sigma) + " to " +
+                                    std::to_string(largest_sigma) + " pixels, got " + std::to_string(sigma));
+    }
     if (image.size() == 0) return;
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
     const PaddedPlanes tensor(tensor_image, radius, threads);
@@ -249,14 +262,12 @@ void smooth_along_edges(ConstImage image, ConstImage tensor_image, float along, 
     const LitBlocks lit(planes, radius, threads);
     const auto smooth_block = [&](int y, int first, int count) {
         const TensorRow here(tensor, y, first);
-        const Gaussians gaussians(here, count, along, across);
+        const Gaussians gaussians(here, count, along, across, radius);
         std::array<float, block_width> weights{};
         // Of every channel, and of the weights.
         std::vector<std::array<float, block_width>> sums(static_cast<std::size_t>(image.channels) + 1);
-        const int rows = std::min(radius, gaussians.rows);
-        const int columns = std::min(radius, gaussians.columns);
-        for (int dy = -rows; dy <= rows; ++dy) {
-            for (int dx = -columns; dx <= columns; ++dx) {
+        for (int dy = -gaussians.rows; dy <= gaussians.rows; ++dy) {
+            for (int dx = -gaussians.columns; dx <= gaussians.columns; ++dx) {
                 const int near = measure_offset(gaussians, static_cast<float>(dx), static_cast<float>(dy),
                                                 across, weights.data());
                 if (near == 0) continue;

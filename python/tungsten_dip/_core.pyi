@@ -88,8 +88,8 @@ def regress(
     """Return ``target`` (3 channels) denoised by first-order regression on ``features`` in local windows.
 
     Neighbours weigh by non-local means of ``guide`` (``guide_variance`` is its noise, same shape), times
-    exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``.
-    At most 16 features; everything must be finite. See ``regress`` in core.hpp.
+    exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``,
+    256 at most. At most 16 features; everything must be finite. See ``regress`` in core.hpp.
     """
 
 def structure_tensor(features: FloatImage, threads: int) -> FloatImage:
@@ -100,7 +100,7 @@ def smooth_along_edges(
 ) -> FloatImage:
     """Return ``image``, averaged by a Gaussian that follows the edges of a `structure_tensor`.
 
-    ``along`` and ``across`` are its standard deviations in pixels. See ``smooth_along_edges`` in core.hpp.
+    ``along`` and ``across`` are its standard deviations, 0.01 to 128 pixels; see core.hpp.
     """
 
 Bits = npt.NDArray[np.uint16]

@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <stdexcept>
 #include <vector>
 
@@ -125,6 +126,9 @@ void what_cannot_be_is_refused() {
     CHECK(refused(1, 2, window));
     CHECK(refused(3, 2, {.radius = 3, .step = 2, .k = 1}));
     CHECK(refused(3, 2, {.radius = -1, .step = 1, .k = 1}));
+    CHECK(refused(3, 2, {.radius = max_radius + 1, .step = 1, .k = 1}));
+    CHECK(!refused(3, 2, {.radius = max_radius, .step = max_radius, .k = 1}));
+    CHECK(refused(3, 2, {.radius = 0, .step = std::numeric_limits<int>::max(), .k = 1}));
     CHECK(refused(3, 2, {.radius = 4, .step = 0, .k = 1}));
     CHECK(refused(3, 2, {.radius = 4, .step = 2, .k = 0}));
 }

@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <stdexcept>
 #include <vector>
 
@@ -81,16 +82,37 @@ void nothing_is_no_error() {
     Pixels none(0, 5, 3);
     Pixels features(0, 5, 2);
     smoothed(none, features);
+}
+
+bool refused(float along, float across) {
     Pixels one(1, 1, 3);
     Pixels tensor(1, 1, 3);
     Pixels out(1, 1, 3);
-    bool refused = false;
     try {
-        smooth_along_edges(one.view(), tensor.view(), 0, 0.3F, out.view(), 1);
+        smooth_along_edges(one.view(), tensor.view(), along, across, out.view(), 1);
     } catch (const std::invalid_argument&) {
-        refused = true;
+        return true;
     }
-    CHECK(refused);
+    return false;
+}
+
+void gaussians_of_no_use_are_refused() {
+    constexpr float inf = std::numeric_limits<float>::infinity();
+    CHECK(!refused(3, 0.3F) && !refused(128, 0.01F));
+    CHECK(refused(0, 0.3F) && refused(129, 0.3F) && refused(inf, 0.3F));
+    CHECK(refused(3, 0) && refused(3, 1e-30F) && refused(3, inf));
+}
+
+// A tensor whose squares overflow leads no further than the radius.
+void steep_edges_are_no_error() {
+    Pixels image(4, 5, 3, 1.0F);
+    Pixels tensor(4, 5, 3);
+    for (int y = 0; y < 4; ++y) {
+        for (int x = 0; x < 5; ++x) tensor.at(y, x, 0) = 1e25F;
+    }
+    Pixels out(4, 5, 3);
+    smooth_along_edges(image.view(), tensor.view(), 3, 0.3F, out.view(), 2);
+    for (const float value : out.values) CHECK(near(value, 1, 1e-5));
 }
 
 void the_exponential_is_close() {
@@ -117,6 +139,8 @@ int main() {
     threads_make_no_difference();
     an_edge_is_kept();
     nothing_is_no_error();
+    gaussians_of_no_use_are_refused();
+    steep_edges_are_no_error();
     the_exponential_is_close();
     no_weight_makes_denormal_products();
     return failed_checks();

@@ -286,6 +286,11 @@ def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     assert any(getattr(one, name) is not getattr(buffers, name) for name in FEATURES)
 
 
+def test_sides_whose_sums_with_a_radius_may_overflow_are_refused() -> None:
+    with pytest.raises(ValueError, match="up to 1000000 each"):
+        _core.box_mean(np.empty((10**6 + 1, 0, 3), np.float32), 1, 2)
+
+
 def test_without_threads_nothing_is_done() -> None:
     with pytest.raises(ValueError, match="threads: expected a whole number from 1 on, got 0"):
         _core.box_mean(np.ones((3, 3, 1), np.float32), 1, 0)
@@ -409,16 +414,30 @@ def test_smoothing_along_edges_refuses_what_does_not_fit() -> None:
     for tensor in (image[:3].copy(), image[:, :, :1].copy()):
         with pytest.raises(ValueError, match="in the size of the image, with 3 channels"):
             _core.smooth_along_edges(image, tensor, along=3, across=0.3, threads=2)
-    with pytest.raises(ValueError, match="above 0"):
-        _smoothed(image, image, along=0, across=0.3)
 
 
 @pytest.mark.parametrize(
-    "window", [{"radius": -1}, {"radius": 5, "step": 2}, {"step": 0}, {"k": 0.0}, {"k": np.nan}]
+    "sigmas",
+    [{"along": a} for a in (0, -1, np.nan, np.inf, 3e9, 1073741814, 129)] + [{"across": 1e-30}],
+)
+def test_smoothing_along_edges_refuses_gaussians_of_no_use(sigmas: dict[str, float]) -> None:
+    image = np.ones((4, 5, 3), np.float32)
+    with pytest.raises(ValueError, match=r"along and across: expected 0.01\d* to 128"):
+        _smoothed(image, image, **{"along": 3, "across": 0.3, **sigmas})
+
+
+@pytest.mark.parametrize(
+    "window",
+    [
+        *({"radius": radius} for radius in (-1, 257, 2**31 - 4, 2**31 - 1)),
+        {"radius": 5, "step": 2},
+        *({"radius": 0, "step": step} for step in (0, 2**31 - 1)),
+        *({"k": k} for k in (0.0, np.nan, 1e30, np.inf)),
+    ],
 )
 def test_a_window_that_cannot_be_searched_is_refused(window):
     image = np.ones((4, 5, 3), np.float32)
-    with pytest.raises(ValueError, match="expected a radius that is a multiple of the step"):
+    with pytest.raises(ValueError, match="expected a radius of 0 to 256 that is a multiple of the step"):
         _core.prefilter_feature(
             image, image, image, None, **{"radius": 5, "step": 1, "k": 0.5, **window}, threads=2
         )
