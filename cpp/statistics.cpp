@@ -34,10 +34,6 @@ constexpr double tile_spread = 0.3;
 // Rendered independently, ten images of five scenes stay within 0.02; Tungsten's Sobol sampler gives -0.18.
 constexpr double tolerated_correlation = 0.05;
 
-// Without a sample variance, texture and shared samples look alike; halves that agree this well are of no
-// use.
-constexpr double agreement = 0.9;
-
 struct Tile {
     double sum = 0;         // S
     double difference = 0;  // D
@@ -284,8 +280,9 @@ HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage varia
     const bool mirrored = correlation.value + margin < -tolerated_correlation;
     const bool alike = correlation.value - margin > tolerated_correlation;
     // Texture makes independent halves look alike; that their variance is as large as the samples' clears
-    // them.
-    const bool shared = std::isnan(ratio.value) ? correlation.value > agreement
+    // them. Without a sample variance nobody can tell, and only copies are shared for certain: with shared
+    // samples noise stays in the image, whereas drawn halves would take fine texture for noise.
+    const bool shared = std::isnan(ratio.value) ? correlation.value >= 1
                                                 : ratio.value + 2 * ratio.standard_error < smallest_ratio;
     return {.correlation = correlation.value,
             .independent = !std::isnan(correlation.value) && !mirrored && !(alike && shared)};
