@@ -41,7 +41,7 @@ ImageView<T> view_of(T* data, const py::array& array) {
 
 // Inputs are read alone: numpy's read-only arrays are welcome.
 ConstImage image_from_array(const std::string& name, const py::array& array) {
-    constexpr py::ssize_t limit = 1'000'000;  // far from where a coordinate and a radius overflow
+    constexpr py::ssize_t limit = 100'000'000;  // times the channels of an image, it is still an int
     const std::string expected =
         name + ": expected an aligned C-contiguous float32 array of shape (height, width, channels), up to " +
         std::to_string(limit) + " each, got ";
