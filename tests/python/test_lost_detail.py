@@ -63,6 +63,16 @@ def test_detail_is_given_back_to_the_dark_as_well() -> None:
         np.testing.assert_allclose(image, noisy, rtol=1e-5)
 
 
+def test_pixels_that_no_sample_lit_are_not_confirmed_by_drawn_halves() -> None:
+    fused = np.full(SHAPE, 0.2, np.float32)
+    halves = np.full(SHAPE, 0.3, np.float32), np.full(SHAPE, 0.25, np.float32)
+    for half in halves:
+        half[5:8, 5:15] = 0
+    for image in with_lost_detail(halves, (fused, fused), drawn=True):
+        assert image.min() == np.float32(0.2)
+    assert with_lost_detail(halves, (fused, fused))[0].min() < 0.01
+
+
 @pytest.mark.parametrize("size", [(1, 1, 3), (1, 9, 3), (7, 5, 3)])
 @pytest.mark.parametrize("radiance", [0.0, 0.3, 1e15])
 def test_any_size_and_radiance_stays_finite(size: tuple[int, ...], radiance: float) -> None:

@@ -69,7 +69,7 @@ def denoised_image(
     result is that of a network without training (``iterations`` 0), and without its ``model``.
     """
     threads = evidence.threads
-    fused = with_lost_detail(evidence.halves, fused)
+    fused = with_lost_detail(evidence.halves, fused, evidence.halves_drawn)
     image = mean_of(fused)
     if all_samples_blend is not None:
         image = with_all_samples(fused, all_samples_blend, threads)

@@ -29,7 +29,7 @@ _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""
 
 
-def with_lost_detail(halves: Halves, fused: Halves) -> Halves:
+def with_lost_detail(halves: Halves, fused: Halves, drawn: bool = False) -> Halves:
     """Add detail back to each half's image that its noisy half contains and the other half confirms.
 
     ``halves`` are the noisy halves and ``fused`` the denoised ones, both linear and in the units of
@@ -40,11 +40,13 @@ def with_lost_detail(halves: Halves, fused: Halves) -> Halves:
         p = (a - f) (b - f) / d,  q = (a - f)^2 / d.
 
     The noise of b is independent, so the slope is the part of the difference a - f that is real; the part
-    that is statistically certain is added back. On most images that is nothing.
+    that is statistically certain is added back. On most images that is nothing. If the halves were ``drawn``
+    from the image, only what is brighter is added: a pixel that no sample lit is 0 in both of its parts,
+    which therefore confirm nothing.
     """
     octaves = [np.log2(_level(noisy) / _level(image)) for noisy, image in zip(halves, fused, strict=True)]
     given = [image.copy() for image in fused]
-    for side in (-1, 1):
+    for side in (1,) if drawn else (-1, 1):
         places = [np.nonzero(side * o >= _OCTAVES[1]) for o in octaves]
         octaves_apart = [side * o[place] for o, place in zip(octaves, places, strict=True)]
         products, squares = [], []
