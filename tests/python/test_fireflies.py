@@ -55,6 +55,9 @@ def test_sparse_light_on_black_is_the_image() -> None:
     limited = limit_fireflies(halves[0], halves[1], 1)
     assert limited.note is None
     np.testing.assert_array_equal(limited.halves, halves)
+    struck = halves[0].copy()
+    struck[20, 30] = 1e5
+    assert limit_fireflies(struck, halves[1], 1).halves[0].max() == pytest.approx(15)
     mean = (halves[0] + halves[1]) / 2
     result = denoise(RenderBuffers(Buffer(mean, *halves)), FitSettings("draft", iterations=5))
     assert result.color.mean() > 0.5 * mean.mean()

@@ -53,7 +53,7 @@ def _error(text: str) -> float:
 
 def _above_zero(text: str, value: float) -> float:
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected more than 0, got '{text}'")
+        raise argparse.ArgumentTypeError(f"expected a finite number above 0, got '{text}'")
     return value
 
 

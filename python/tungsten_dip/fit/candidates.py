@@ -36,7 +36,7 @@ def checked_previous(buffers: RenderBuffers, previous: Halves | None) -> Halves 
 
 
 def _checked_pair(what: str, pair: Halves, buffers: RenderBuffers) -> Halves:
-    if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
+    if not (isinstance(pair, Sized) and len(pair) == 2):
         got = len(pair) if isinstance(pair, Sized) else type(pair).__name__
         raise InputError(f"{what}: expected a pair of images, one per half, got {got}")
     expected = buffers.color.mean.shape

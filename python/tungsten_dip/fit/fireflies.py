@@ -63,14 +63,18 @@ def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> Lim
 
     What is about equal in both halves is left alone, whatever its radiance, and so is everything up to 15
     times the mean of the 17x17 pixels around it. Where that would be most of the pixels that have any light,
-    they are no fireflies but the image: stars, or a caustic on black.
+    they are the image (stars, or a caustic on black), and fireflies are 15 times brighter than their median.
     """
     levels = [_level(half) for half in (half_a, half_b)]
     around = _surroundings((levels[0] + levels[1]) / 2, threads)
     limits = [np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other) for other in levels[::-1]]
     count = sum(int(np.count_nonzero(level > limit)) for level, limit in zip(levels, limits, strict=True))
     lit = sum(int(np.count_nonzero(level)) for level in levels)
-    if count == 0 or 2 * count > lit:
+    if 2 * count > lit:
+        typical = np.median(np.concatenate([level[level > 0] for level in levels]))
+        limits = [np.maximum(limit, _LIMIT * typical) for limit in limits]
+        count = sum(int(np.count_nonzero(level > limit)) for level, limit in zip(levels, limits, strict=True))
+    if count == 0:
         return Limited((half_a, half_b))
     a, b = (_limited(*given) for given in zip((half_a, half_b), levels, limits, strict=True))
     taken = [np.maximum(level - limit, 0) for level, limit in zip(levels, limits, strict=True)]

@@ -34,8 +34,8 @@ _NOISE_RADIUS = 1
 _CORRELATION_RADIUS = 8
 
 _LEAST_SHAPE = 1e-2
-_SHAPE_OF_ONE_SAMPLE = 0.05
-"""One half has all of such a pixel: a single sample was so bright."""
+_SHAPE_OF_ONE_SAMPLE = 0.07
+"""One half has all of such a pixel, in every channel: a single sample was so bright."""
 
 _STRAY = 8 / 3
 """Emission of more than so many times the mean of the 8 pixels around was hit by chance: a lamp's corner has
@@ -121,7 +121,9 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     share = np.repeat(
         beta(level.sum(axis=2), noise.sum(axis=2), _LEAST_SHAPE_OF_LAMPS * lit)[:, :, None], 3, 2
     )
-    apart = (drawn.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]) & ~lit
+    one_sample = level.sum(axis=2) < _SHAPE_OF_ONE_SAMPLE * noise.sum(axis=2)
+    apart = drawn.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]
+    apart &= ~lit & ~one_sample
     share[apart] = beta(level[apart], noise[apart], 0)
     return share
 

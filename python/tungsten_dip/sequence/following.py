@@ -182,7 +182,7 @@ class Follower:
         if result.interrupted:
             error = None  # of a fit that was cut short
         if error is not None and self._error is not None and error > _CUT_ERROR * self._error:
-            raise _CutError(f"the error is {error / self._error:.1f} times that of the previous frame")
+            raise _CutError(f"the error is {error / self._error:.1f} times that of the last frame with noise")
         kept = result.model or model
         if moved is None:
             self.models = replace(self.models, first=kept)
