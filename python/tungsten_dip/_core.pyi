@@ -82,7 +82,7 @@ def regress(
     *,
     radius: int,
     step: int,
-    k: float = ...,
+    k: float = 1.0,
     threads: int,
 ) -> FloatImage:
     """Return ``target`` (3 channels) denoised by first-order regression on ``features`` in local windows.

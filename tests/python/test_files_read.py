@@ -476,6 +476,9 @@ def test_the_picture_is_what_a_renderer_denoised_itself(tmp_path: Path, noisy: s
     channels = save(path, *rgb(noisy), *rgb(denoised), *rgb("ViewLayer.DiffCol"))
     np.testing.assert_array_equal(read_image(path), np.stack([channels[n] for n in rgb(denoised)], axis=-1))
     assert holds(read_buffers(path).color, channels, *rgb(noisy))
+    # A single channel of that name is no picture.
+    channels = save(path, *rgb(noisy), f"{denoised}.Z")
+    np.testing.assert_array_equal(read_image(path), np.stack([channels[n] for n in rgb(noisy)], axis=-1))
 
 
 @pytest.mark.parametrize("name", ["noisy", "Noisy Image", "color", "albedo"])

@@ -121,8 +121,9 @@ def denoised_layer(channel_names: Iterable[str]) -> str | None:
 
     Blender keeps the noisy picture as "Noisy Image" beside "Combined".
     """
-    layers = {name.rpartition(".")[0] for name in channel_names}
-    by_name = {layer.lower(): layer for layer in layers}
+    names = set(channel_names)
+    layers = {name.rpartition(".")[0] for name in names}
+    by_name = {layer.lower(): layer for layer in layers if {f"{layer}.{c}" for c in "RGB"} <= names}
     shown = [
         by_name[before + dot + alias]
         for before, dot, last in (name.rpartition(".") for name in by_name)

@@ -74,7 +74,7 @@ def write_outputs(
     """Write a denoised render beside its own files.
 
     These are ``<stem>_denoised.exr``, ``<stem>_denoised.png``, ``<stem>_side_by_side.png`` and, where asked
-    for, the report and the fitted network. ``remarks`` are lines on the render for the report.
+    for, the report and the fitted network. ``remarks`` are what was logged of the render and the fit.
     """
     exr, png, pair = outputs.denoised()
     noisy, denoised = (display_from_radiance(color, tonemap) for color in (buffers.color.mean, result.color))

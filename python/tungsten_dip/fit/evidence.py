@@ -271,7 +271,7 @@ def with_best_baseline(evidence: Evidence) -> Evidence:
 
 
 def _best(choices: Sequence[Halves], denominators: Halves) -> int:
-    """Return the index of the best but for the noisy halves, the first."""
+    """Return the index of the choice with the least error; the noisy halves, the first, do not count."""
     mean_errors = [
         sum(float(np.minimum(error, 1).mean()) for error in _errors(choice, choices[0], denominators))
         for choice in choices[1:]
@@ -350,7 +350,7 @@ def _errors(pilot: Halves, halves: Halves, denominators: Halves) -> Halves:
 
 
 def relative_error(image: FloatImage, other: FloatImage, denominator: FloatImage) -> FloatImage:
-    """Return the mean over the channels, relative to a denominator of shape (height, width, 1)."""
+    """Return the mean squared difference of the channels over a denominator, shape (height, width, 1)."""
     error: FloatImage = channel_mean((image - other) ** 2) / denominator
     return error
 
