@@ -11,6 +11,7 @@ import pytest
 
 from commands import MAIN, SCENE, fails, write_frames, write_scene
 from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image, write_image
+from tungsten_dip.buffers.image_file import MOST_HDR
 from tungsten_dip.cli import denoising, tungsten
 from tungsten_dip.cli.scene_outputs import SceneOutputs, write_render
 from tungsten_dip.errors import InputError
@@ -193,15 +194,18 @@ def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capf
     assert len(renders) == 1
 
 
-def test_negative_radiance_is_black_in_a_hdr_and_loses_no_render(tmp_path, caplog):
+def test_radiance_that_a_hdr_does_not_hold_is_clipped_and_loses_no_render(tmp_path, caplog):
     radiance = np.full((2, 3, 3), 0.5, np.float32)
-    radiance[0, 0] = -0.25
+    radiance[0] = np.array([[-0.25], [np.nan], [np.inf]])
     picture, buffer = tmp_path / "picture.hdr", tmp_path / "buffer.hdr"
     request = OutputBuffer(type="color", hdr_output_file=str(buffer))
     write_render(RenderBuffers(Buffer(radiance)), SceneOutputs(None, picture, (request,)), "gamma")
     for path in (picture, buffer):
-        np.testing.assert_array_equal(read_image(path), np.maximum(radiance, 0))
-        assert f"{path}: holds no negative values" in caplog.text
+        image = read_image(path)
+        np.testing.assert_array_equal(image[0, :2], 0)
+        np.testing.assert_allclose(image[0, 2], MOST_HDR, rtol=1 / 128)
+        np.testing.assert_array_equal(image[1], radiance[1])
+        assert f"{path}: holds 0 to 1.7e+38" in caplog.text
 
 
 @pytest.mark.parametrize(

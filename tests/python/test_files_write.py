@@ -35,7 +35,7 @@ from tungsten_dip.buffers import (
     write_text,
     write_tungsten_folder,
 )
-from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.image_file import MOST_HDR, write_exr
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
@@ -586,13 +586,22 @@ def test_png_clips_and_rounds(tmp_path: Path) -> None:
     assert stored.ravel().tolist() == [0, 0, 0, 1, 255, 255]
 
 
-def test_negative_values_are_not_lost_in_a_format_without_sign(tmp_path: Path) -> None:
-    image = noise((3, 2, 3)) - np.float32(0.5)
-    with pytest.raises(InputError, match=r"a\.hdr: expected no negative values, .*; use \.exr or \.pfm"):
+@pytest.mark.parametrize("value", [-0.5, np.inf, np.nan, 2.0**127])
+def test_values_that_a_hdr_would_lose_are_refused(tmp_path: Path, value: float) -> None:
+    image = noise((3, 2, 3))
+    image[1, 1, 1] = value
+    with pytest.raises(
+        InputError, match=r"a\.hdr: expected values from 0 to 1.7e\+38, .*; use \.exr or \.pfm"
+    ):
         write_image(tmp_path / "a.hdr", image)
     for suffix in (".exr", ".pfm"):
         write_image(tmp_path / f"a{suffix}", image)
-        assert np.array_equal(read_image(tmp_path / f"a{suffix}"), image)
+        assert np.array_equal(read_image(tmp_path / f"a{suffix}"), image, equal_nan=True)
+
+
+def test_a_hdr_holds_its_largest_value(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.hdr", np.full((3, 2, 3), MOST_HDR))
+    np.testing.assert_allclose(read_image(tmp_path / "a.hdr"), MOST_HDR, rtol=1 / 128)
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png"])

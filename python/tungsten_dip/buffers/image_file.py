@@ -36,6 +36,9 @@ RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
 MAX_PIXELS = 2**28
 """The largest image read: 16384 x 16384. One channel of it is 1 GiB of float32."""
 
+MOST_HDR = np.nextafter(np.float32(2.0**127), np.float32(0))
+"""The largest value that .hdr holds: encoders turn what the exponent of RGBE does not reach into black."""
+
 _MOST_BYTES = 16 << 30
 """The most that all parts of a file may hold: zeros take a thousandth of it on disk."""
 
@@ -191,7 +194,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
     (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if these are no numbers
-    or too large ones, if a .hdr would lose negative values, or if the file cannot be written.
+    or too large ones for float32, if they are not all from 0 to MOST_HDR for a .hdr, or if the file cannot be
+    written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -209,8 +213,11 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         write_exr(path, [Part(channels)])
         return
     if suffix == ".hdr":
-        if (image < 0).any():
-            raise InputError(f"{path}: expected no negative values, which .hdr cannot hold; use .exr or .pfm")
+        if not ((image >= 0) & (image <= MOST_HDR)).all():
+            raise InputError(
+                f"{path}: expected values from 0 to {MOST_HDR:.2g}, which .hdr holds, got "
+                f"{image.min():.2g} to {image.max():.2g}; use .exr or .pfm"
+            )
         image = np.broadcast_to(image, (*image.shape[:2], 3))
     height, width, count = image.shape
     spec = oiio.ImageSpec(width, height, count, "uint8" if suffix == ".png" else "float")

@@ -12,7 +12,7 @@ import numpy as np
 
 from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
 from tungsten_dip.buffers.display import ldr_from_feature
-from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
+from tungsten_dip.buffers.image_file import MOST_HDR, RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
 from tungsten_dip.buffers.layers import planes_of_output
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
@@ -169,9 +169,11 @@ def write_render(buffers: RenderBuffers, outputs: SceneOutputs, tonemap: Tonemap
 
 def _write(path: Path, image: FloatImage) -> None:
     """Write an image as far as its format holds it: a refusal would come after the render, and lose it."""
-    if path.suffix.lower() == ".hdr" and (image < 0).any():
-        _LOG.warning("%s: holds no negative values, which are 0 there; .exr does", path)
-        image = np.maximum(image, 0)
+    if path.suffix.lower() == ".hdr":
+        held = np.nan_to_num(image.clip(0, MOST_HDR), nan=0)
+        if not np.array_equal(held, image):
+            _LOG.warning("%s: holds 0 to %.2g; other values are clipped, NaN is 0; .exr does", path, MOST_HDR)
+        image = held
     write_image(path, image)
 
 
