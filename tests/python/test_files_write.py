@@ -810,7 +810,9 @@ def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path: Path, suffix: str, m
         "write_image(sys.argv[1], np.random.default_rng(0).random((80, 90, 3)).astype(np.float32))"
     )
     done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True)
-    assert "InputError" in done.stderr
+    reason = done.stderr.splitlines()[-1]
+    assert f"InputError: {path}: cannot be written (" in reason
+    assert "on a disk with room" in reason
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"old"]
 
 
