@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from fractions import Fraction
 
@@ -28,7 +29,7 @@ def unaligned() -> np.ndarray:
     [
         (GREY.astype(np.float64), "expected float32, got float64"),
         (GREY[:3], r"expected shape \(4, 5, 3\)"),
-        (GREY[:, :, :1], r"expected shape \(4, 5, 3\)"),
+        (GREY[:, :, :1], r"expected shape \(height, width, 3\)"),
         (np.asfortranarray(GREY), "expected aligned rows"),
         (unaligned(), "expected aligned rows"),
     ],
@@ -36,6 +37,39 @@ def unaligned() -> np.ndarray:
 def test_arrays_of_another_kind_are_refused(half, words):
     with pytest.raises(InputError, match=f"^color half_a: {words}"):
         RenderBuffers(Buffer(GREY, half, GREY))
+
+
+def of_shape(*shape: int) -> np.ndarray:
+    return np.ones(shape, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "shape", "remedy"),
+    [
+        ("color", (4, 5), "numpy.dstack([image] * 3) makes three channels of one"),
+        ("color", (4, 5, 1), "numpy.dstack([image] * 3) makes three channels of one"),
+        ("color", (4, 5, 4), "use image[..., :3].copy(), and image[..., 3:].copy() as alpha"),
+        ("color", (3, 4, 5), "give one image, its channels on the last axis"),
+        ("color", (1, 4, 5, 3), "give one image, its channels on the last axis"),
+        ("color", (5,), "give one image, its channels on the last axis"),
+        ("depth", (4, 5), "image[..., None] adds the axis of channels"),
+        ("depth", (4, 5, 3), "give one image, its channels on the last axis"),
+        ("depth", (5, 4, 1), "render all buffers at one size"),
+        ("alpha", (4, 5), "image[..., None] adds the axis of channels"),
+        ("spp", (4, 6, 1), "render all buffers at one size"),
+    ],
+)
+def test_an_array_of_another_shape_is_told_how_to_fit(quantity, shape, remedy):
+    array = of_shape(*shape)
+    given = array if quantity in ("alpha", "spp") else Buffer(array)
+    with pytest.raises(InputError, match=f"^{quantity}.*: expected shape .*; {re.escape(remedy)}$"):
+        RenderBuffers(**{"color": Buffer(GREY), quantity: given})
+
+
+def test_the_remedies_for_shapes_help():
+    grey, rgba, depth = of_shape(4, 5), of_shape(4, 5, 4), of_shape(4, 5)
+    color = Buffer(rgba[..., :3].copy(), np.dstack([grey] * 3), np.dstack([grey[..., None]] * 3))
+    RenderBuffers(color, depth=Buffer(depth[..., None]), alpha=rgba[..., 3:].copy())
 
 
 @pytest.mark.parametrize(

@@ -116,13 +116,13 @@ class RenderBuffers:
             object.__setattr__(self, "spp", float(self.spp))  # numpy's numbers are no attributes of files
         elif self.spp is not None:
             check_array("spp", self.spp, "use a number, or an array where it varies")
-        expected = self.color.mean.shape[:2]
+        size = self.color.mean.shape[:2]
         for quantity, buffer in self.quantities():
             for plane, array in buffer.planes():
-                _check(f"{quantity} {plane}", array, (*expected, CHANNELS[quantity]))
+                _check(f"{quantity} {plane}", array, size, CHANNELS[quantity])
         for name, more in (("alpha", self.alpha), ("spp", self.spp)):
             if isinstance(more, np.ndarray):
-                _check(name, more, (*expected, 1))
+                _check(name, more, size, 1)
         if self.source and any(
             _differs(getattr(self, name), self.source.read.get(name)) for name in (*CHANNELS, "alpha", "spp")
         ):
@@ -190,13 +190,28 @@ def as_float32(what: str, array: npt.NDArray[Any]) -> FloatImage:
         raise InputError(f"{what}: expected values up to 3e38 (float32), got larger ones; scale it") from None
 
 
-def _check(what: str, array: FloatImage, shape: tuple[int, ...]) -> None:
+def _check(what: str, array: FloatImage, size: tuple[int, ...], channels: int) -> None:
     if array.dtype != np.float32:
         raise InputError(f"{what}: expected float32, got {array.dtype}; use .astype(np.float32)")
-    if array.shape != shape:
+    if array.ndim != 3 or array.shape[2] != channels:
         raise InputError(
-            f"{what}: expected shape {shape} (height, width, channels) as the colour has it, got "
-            f"{array.shape}; render all buffers at one size"
+            f"{what}: expected shape (height, width, {channels}), got {array.shape}; "
+            f"{_channels_remedy(array.shape, channels)}"
+        )
+    if array.shape[:2] != size:
+        raise InputError(
+            f"{what}: expected shape {(*size, channels)} as the colour has it, got {array.shape}; render all "
+            f"buffers at one size"
         )
     if not (array.flags.c_contiguous and array.flags.aligned):
         raise InputError(f"{what}: expected aligned rows one after the other in memory; use .copy()")
+
+
+def _channels_remedy(shape: tuple[int, ...], channels: int) -> str:
+    if channels == 1 and len(shape) == 2:
+        return "image[..., None] adds the axis of channels"
+    if channels == 3 and (len(shape) == 2 or shape[2:] == (1,)):
+        return "numpy.dstack([image] * 3) makes three channels of one"
+    if channels == 3 and shape[2:] == (4,):
+        return "use image[..., :3].copy(), and image[..., 3:].copy() as alpha"
+    return "give one image, its channels on the last axis"
