@@ -727,7 +727,9 @@ def test_without_colour(tmp_path: Path) -> None:
     refused(tmp_path / "a.exr", "no colour.*found Z, albedo; use --map color=LAYER")
     save(tmp_path / "b.exr", "R", "G")
     refused(tmp_path / "b.exr", "no colour.*found R, G; use --map")
-    with pytest.raises(InputError, match="R, G, B or Y"):
+    with pytest.raises(
+        InputError, match=r"a\.exr: expected R, G, B or Y, .*found Z, albedo; .*; name another"
+    ):
         read_image(tmp_path / "a.exr")
 
 
@@ -736,6 +738,18 @@ def test_the_picture_of_a_file_without_one_at_the_top_level_is_its_colour(tmp_pa
     picture = read_image(tmp_path / "a.exr")
     for index, name in enumerate(rgb("ViewLayer.Combined")):
         assert np.array_equal(picture[:, :, index], channels[name])
+
+
+@pytest.mark.parametrize("window", [(WIDTH, HEIGHT), (WIDTH + 2, HEIGHT)])
+def test_the_picture_is_found_in_any_part_whatever_fits_it(tmp_path: Path, window: tuple[int, int]) -> None:
+    width, height = window
+    color = {n: pixels(seed, height=height, width=width) for seed, n in enumerate("RGB")}
+    noisy = {n: pixels(seed + 3) for seed, n in enumerate("RGB")}
+    for others in ({}, {"Noisy Image": noisy}):
+        save_parts(tmp_path / "a.exr", depth={"Z": pixels(9)}, **others, Combined=color)
+        picture = read_image(tmp_path / "a.exr")
+        np.testing.assert_array_equal(picture, np.stack(list(color.values()), axis=-1))
+        assert picture.flags.c_contiguous
 
 
 def test_depth_of_three_different_channels(tmp_path: Path) -> None:

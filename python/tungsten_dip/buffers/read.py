@@ -84,17 +84,20 @@ def read_image(path: str | Path) -> FloatImage:
     Raises InputError if the file is missing, damaged or no image, or if there is no colour.
     """
     path = Path(path)
-    channels = read_parts(path)[0].channels
+    parts = read_parts(path)
+    channels = parts[0].channels
     names = next((names for names in ("RGB", "Y") if all(name in channels for name in names)), None)
     if names is None:
+        source, _ = _unwrapped(path, parts)
+        denoised = denoised_layer(_full_names(source.parts))
         try:
-            denoised = denoised_layer(channels)
-            return read_buffers(path, {"color": denoised} if denoised else None).color.mean
+            owner, found = _find_layers(replace(source, mapping={"color": denoised}) if denoised else source)
         except InputError as error:
-            found = ", ".join(channels)
             raise InputError(
-                f"{path}: expected channels R, G, B or Y, found {found}; name another file"
+                f"{path}: expected R, G, B or Y, or a layer that is the picture ({error}); name another file"
             ) from error
+        color = found.channels["color"]
+        return _plane(path, "color", color, owner, owner[color[0]][0])
     try:
         check_no_chroma(names, channels)
     except InputError as error:
@@ -218,17 +221,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     main, _ = owner[groups["color"][0]]
     color_part = next(index for index, part in enumerate(source.parts) if part is main)
     attributes = {**attributes, **main.attributes}
-    planes: dict[str, FloatImage] = {}
-    for key, names in groups.items():
-        channels = []
-        for part, name in (owner[name] for name in names):
-            if part.window != main.window:
-                raise InputError(_sizes_differ(f"{path}: {key}", part, main))
-            channels.append(part.channels[name])
-        stacked = np.stack([channel.astype(np.float32) for channel in channels], axis=-1)
-        planes[key] = _with_channel_count(stacked, path, key, names)
-        if planes[key] is stacked:
-            _share(stacked, [owner[name] for name in names])
+    planes = {key: _plane(path, key, names, owner, main) for key, names in groups.items()}
     spp = attributes.get(SPP, attributes.get("samplesPerPixel"))
     spp = float(spp) if isinstance(spp, (int, float)) and 0 < spp <= MOST_SPP else None
     if "colorVariance" not in source.mapping:
@@ -251,6 +244,26 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
         source=replace(source, color_part=color_part, read=buffers),
     )
+
+
+def _plane(
+    path: Path, key: str, names: tuple[str, ...], owner: Mapping[str, tuple[Part, str]], main: Part
+) -> FloatImage:
+    """Make one image of channels of one key of --map. Raises InputError if their part differs in its window.
+
+    ``main`` is the part that holds the colour.
+    """
+    sources = [owner[name] for name in names]
+    channels = []
+    for part, name in sources:
+        if part.window != main.window:
+            raise InputError(_sizes_differ(f"{path}: {key}", part, main))
+        channels.append(part.channels[name])
+    stacked = np.stack([channel.astype(np.float32) for channel in channels], axis=-1)
+    plane = _with_channel_count(stacked, path, key, names)
+    if plane is stacked:
+        _share(stacked, sources)
+    return plane
 
 
 def _full_names(parts: Sequence[Part]) -> dict[str, tuple[Part, str]]:
