@@ -598,6 +598,8 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
         {"threads": 0},
         {"channels": ()},
         {"channels": (8, 0)},
+        {"channels": "8,16"},
+        {"channels": 8},
         {"channels": (8,) * 9},
         {"channels": (8, 1 << 20)},
         {"iterations": 1.5},
@@ -635,7 +637,7 @@ def test_numbers_of_numpy_are_settings_as_well(render: SyntheticRender, tmp_path
         float,
     ]
     write_denoised(tmp_path / "out.exr", denoise(render.buffers, settings), render.buffers)
-    assert FitSettings("paper", channels=(np.int64(8), np.int64(16))).channels == (8, 16)
+    assert FitSettings("paper", channels=[np.int64(8), 16]).channels == (8, 16)
 
 
 def test_settings_come_back_with_the_result(render: SyntheticRender) -> None:
