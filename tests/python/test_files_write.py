@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from tungsten_dip.buffers import (
     RenderBuffers,
     atomic,
     check_writable,
+    image_file,
     read_buffers,
     read_image,
     replacing,
@@ -115,6 +117,24 @@ def test_writing_leaves_no_threads_behind(tmp_path: Path) -> None:
     """A process that forks later must have none."""
     before = OpenEXR.global_thread_count()
     write_exr(tmp_path / "a.exr", [Part({"R": noise((64, 64))})], threads=before + 2)
+    assert OpenEXR.global_thread_count() == before
+
+
+def test_writers_at_once_leave_no_threads_behind() -> None:
+    before = OpenEXR.global_thread_count()
+    second_began, first_ended = Event(), Event()
+
+    def second() -> None:
+        with image_file._compressing(before + 2):
+            second_began.set()
+            first_ended.wait()
+
+    thread = Thread(target=second)
+    with image_file._compressing(before + 2):
+        thread.start()
+        second_began.wait(0.2)  # in vain: it waits for the first
+    first_ended.set()
+    thread.join()
     assert OpenEXR.global_thread_count() == before
 
 

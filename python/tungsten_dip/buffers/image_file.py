@@ -15,6 +15,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,9 @@ _PFM_HEADER = re.compile(rb"(P[Ff])@(\d+)@(\d+)@(\S+)\s".replace(b"@", rb"(?:\s|
 """Kind, width, height, scale, between them white space and comments."""
 
 _LONGEST_PFM_HEADER = 1 << 12
+
+_THREAD_POOL = Lock()
+"""OpenEXR's is that of the process: of two who change its size, neither could restore it."""
 
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
@@ -181,12 +185,13 @@ def write_exr(path: Path, parts: Iterable[Part], threads: int | None = None) -> 
 @contextmanager
 def _compressing(threads: int) -> Iterator[None]:
     """Let OpenEXR use so many threads, for as long as it is needed: a process that forks must have none."""
-    before = OpenEXR.global_thread_count()
-    OpenEXR.set_global_thread_count(threads)
-    try:
-        yield
-    finally:
-        OpenEXR.set_global_thread_count(before)
+    with _THREAD_POOL:
+        before = OpenEXR.global_thread_count()
+        OpenEXR.set_global_thread_count(threads)
+        try:
+            yield
+        finally:
+            OpenEXR.set_global_thread_count(before)
 
 
 def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
