@@ -59,7 +59,7 @@ format: $(VENV)/developing ## bring all code into shape
 	$(BIN)/clang-format -i $(CXX_SOURCES)
 
 clean: ## remove everything that was installed or built
-	rm -rf $(VENV) build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build demo python/tungsten_dip/bin .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find python tests -name __pycache__ -prune -exec rm -rf {} +
 	find python -name '*.so' -delete -o -name '*.egg-info' -prune -exec rm -rf {} +
 
