@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,13 +76,13 @@ def cropped_as_published(bench_set: BenchSet) -> BenchSet:
 
 def cropped(buffers: RenderBuffers, part: tuple[slice, slice]) -> RenderBuffers:
     """Return rows and columns of what a fit sees: every plane of every quantity, alpha and the samples."""
-    quantities = {
+    quantities: dict[str, Any] = {
         name: Buffer(**{plane: np.ascontiguousarray(values[part]) for plane, values in buffer.planes()})
         for name, buffer in buffers.quantities()
     }
     spp = np.ascontiguousarray(buffers.spp[part]) if isinstance(buffers.spp, np.ndarray) else buffers.spp
     alpha = None if buffers.alpha is None else np.ascontiguousarray(buffers.alpha[part])
-    return RenderBuffers(quantities.pop("color"), spp=spp, alpha=alpha).with_quantities(**quantities)
+    return RenderBuffers(**quantities, spp=spp, alpha=alpha)
 
 
 def _read_set(text: str) -> BenchSet:

@@ -6,8 +6,7 @@ https://www.openimagedenoise.org, through the package ``pyoidn``, on the CPU.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -49,13 +48,12 @@ def oidn_image(
     if normal is not None and albedo is None:
         _LOG.info("Open Image Denoise uses normals only together with an albedo: the normals are left out")
         normal = None
-    color_buffer = Buffer(np.ascontiguousarray(color))
-    features = {
-        name: Buffer(np.ascontiguousarray(feature))
-        for name, feature in (("albedo", albedo), ("normal", normal))
-        if feature is not None
+    given: dict[str, Any] = {
+        name: Buffer(np.ascontiguousarray(image))
+        for name, image in (("color", color), ("albedo", albedo), ("normal", normal))
+        if image is not None
     }
-    repaired, _ = sanitize(RenderBuffers(color_buffer).with_quantities(**features), threads)
+    repaired, _ = sanitize(RenderBuffers(**given), threads)
     images: dict[str, FloatImage] = {name: buffer.mean for name, buffer in repaired.quantities()}
     images["output"] = np.empty_like(images["color"])
     qualities = {
@@ -87,13 +85,10 @@ def oidn_pilot(
     ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
     shape (height, width, 3). So are the results.
     """
-
-    def of_colors(feature: Buffer | None) -> Sequence[FloatImage | None]:
-        if feature is None:
-            return [None] * len(colors)
-        return feature.halves_or_mean if len(colors) == 2 else (feature.mean,)
-
-    features = of_colors(buffers.albedo), of_colors(buffers.normal)
+    features = (
+        feature.images(len(colors)) if feature else [None] * len(colors)
+        for feature in (buffers.albedo, buffers.normal)
+    )
     return tuple(
         np.maximum(scaled(oidn_image(color / np.float32(scale), *given, threads=threads), scale), 0)
         for color, *given in zip(colors, *features, strict=True)

@@ -122,7 +122,7 @@ def surfaces_of_halves(
     ]
     albedo_pairs: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
     if filtered.albedo is not None:
-        albedo_pairs = list(zip(albedos, _planes(filtered.albedo, count), strict=True))
+        albedo_pairs = list(zip(albedos, filtered.albedo.images(count), strict=True))
     return tuple(
         _surfaces(channels, flat, albedo_pair, color.shape, scale, threads)
         for channels, albedo_pair, color in zip(channels_of_colors, albedo_pairs, colors, strict=True)
@@ -148,7 +148,7 @@ def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: floa
     """
     return tuple(
         np.minimum(plane, 1 + np.maximum(color / np.float32(scale), 0))
-        for plane, color in zip(_planes(albedo, len(colors)), colors, strict=True)
+        for plane, color in zip(albedo.images(len(colors)), colors, strict=True)
     )
 
 
@@ -235,7 +235,7 @@ def _feature_channels(
     """
     scaled: list[tuple[str, FloatImage, float]] = []
     if filtered.albedo is not None:
-        albedo = _planes(filtered.albedo, count)[index]
+        albedo = filtered.albedo.images(count)[index]
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
         bounded = np.clip(albedo, 0, 1) + brightness
@@ -244,10 +244,10 @@ def _feature_channels(
         else:
             scaled.append(("albedo", bounded, _ALBEDO_PENALTY))
     if filtered.normal is not None:
-        normal = np.clip(_planes(filtered.normal, count)[index], -1, 1)
+        normal = np.clip(filtered.normal.images(count)[index], -1, 1)
         scaled.append(("normal", normal, _NORMAL_PENALTY))
     if filtered.depth is not None:
-        depth = _planes(filtered.depth, count)[index]
+        depth = filtered.depth.images(count)[index]
         # Bounded for any unit of length; near and far surfaces stay apart.
         bounded = np.float32(_DEPTH_SCALE) * depth / (depth + np.float32(depth_scale))
         scaled.append(("depth", bounded, _DEPTH_PENALTY))
@@ -256,11 +256,6 @@ def _feature_channels(
         for name, image, penalty in scaled
         for column, channel in enumerate(_CHANNELS[name])
     }
-
-
-def _planes(feature: Buffer, count: int) -> tuple[FloatImage, ...]:
-    """Both halves of a feature, or its mean alone for one colour."""
-    return feature.halves_or_mean if count == 2 else (feature.mean,)
 
 
 def divisor(albedo: FloatImage) -> FloatImage:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
+from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, Quantity, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
@@ -22,7 +23,6 @@ RANDOM_INPUT_SCALE = 0.1
 
 _QUANTITY_FROM_INPUTS: dict[str, Quantity] = {"normals": "normal", "depths": "depth", "albedos": "albedo"}
 _QUANTITIES: tuple[Quantity, ...] = ("normal", "albedo", "depth")
-_PLANES = ("mean", "half_a", "half_b", "variance")
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
             )
     for quantity in quantities:
         buffer = buffers.get(quantity)
-        missing = _PLANES if buffer is None else [p for p in _PLANES if getattr(buffer, p) is None]
+        missing = tuple(PLANES) if buffer is None else [p for p in PLANES if getattr(buffer, p) is None]
         if missing:
             notes.append(f"{quantity}: no {', '.join(missing)}, used without")
         if buffer is not None:
