@@ -59,9 +59,9 @@ format: $(VENV)/developing ## bring all code into shape
 	$(BIN)/clang-format -i $(CXX_SOURCES)
 
 clean: ## remove everything that was installed or built
-	rm -rf $(VENV) build demo python/tungsten_dip/bin .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build demo python/*.egg-info python/tungsten_dip/bin .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find python tests -name __pycache__ -prune -exec rm -rf {} +
-	find python -name '*.so' -delete -o -name '*.egg-info' -prune -exec rm -rf {} +
+	find python -name '*.so' -exec rm {} +
 
 # $(call missing,what,Debian's packages,Fedora's packages,the command on macOS): say so and stop.
 missing = { printf '%s\n' 'This needs $(1). It comes with:' '  Debian, Ubuntu   apt install $(2)' \
