@@ -70,7 +70,6 @@ void bind(const py::module_& module) {
         .def_readonly("integrator", &RenderPlan::integrator)
         .def_readonly("tonemap", &RenderPlan::tonemap)
         .def_readonly("output_file", &RenderPlan::output_file)
-        .def_readonly("hdr_output_file", &RenderPlan::hdr_output_file)
         .def_readonly("checkpoint_interval_s", &RenderPlan::checkpoint_interval_s)
         .def_readonly("timeout_s", &RenderPlan::timeout_s)
         .def_readonly("resume", &RenderPlan::resume)

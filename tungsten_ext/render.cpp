@@ -215,7 +215,6 @@ Render::Render(const std::string& scene_path, const RenderOptions& options)
         .integrator = self.scene->integrator()->toJson(document.GetAllocator())["type"].GetString(),
         .tonemap = self.scene->camera()->tonemapOp().toString(),
         .output_file = absolute_name(settings.outputFile()),
-        .hdr_output_file = absolute_name(settings.hdrOutputFile()),
         .checkpoint_interval_s = StringUtils::parseDuration(settings.checkpointInterval()),
         .timeout_s = StringUtils::parseDuration(settings.timeout()),
         .resume = settings.enableResumeRender() && self.integrator().supportsResumeRender(),

@@ -48,13 +48,12 @@ struct RenderBuffers {
     std::shared_ptr<void> memory;
 };
 
-// What a driver needs to know of the scene file, after the overrides. File names are absolute; empty: not
-// asked for.
+// What a driver needs to know of the scene file, after the overrides. The name of the picture is absolute;
+// empty: not asked for.
 struct RenderPlan {
     std::string integrator;
     std::string tonemap;
     std::string output_file;
-    std::string hdr_output_file;
     double checkpoint_interval_s;
     double timeout_s;
     bool resume;           // the scene asks for it and the integrator can do it
