@@ -11,7 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tungsten_dip.buffers import FloatImage, read_image
+from tungsten_dip.buffers.read import read_image
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.report.metrics import compare
 from tungsten_dip.sequence.flicker import flicker

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from conftest import synthetic_render
-from tungsten_dip.buffers import read_buffers, write_denoised
+from tungsten_dip.buffers.read import read_buffers
+from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.scene.effects import inspect_facts

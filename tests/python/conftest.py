@@ -14,9 +14,9 @@ import pytest
 
 from commands import write_scene
 from fitted_models import DRAFT
-from tungsten_dip.buffers import write_tungsten_folder
 from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.result import HistoryPoint

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from hypothesis import strategies
 
 from conftest import relmse, synthetic_render
-from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, sanitize
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.fit import FitResult
 
 HEIGHT, WIDTH, SPP = 32, 48, 16

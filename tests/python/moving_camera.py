@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers import write_tungsten_folder
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.scene.types import Camera
 

@@ -21,7 +21,10 @@ from tungsten_dip.bench.pareto import run_pareto
 from tungsten_dip.bench.results import COLUMNS, Key, Measurement, Results
 from tungsten_dip.bench.sets import cropped_as_published, read_sets
 from tungsten_dip.bench.table import Row, SetRows, markdown_table
-from tungsten_dip.buffers import RenderBuffers, read_image, write_denoised, write_image, write_tungsten_folder
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.read import read_image
+from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult

@@ -232,7 +232,8 @@ def test_what_cannot_be_timed_is_one_line(arguments, words, capfd):
 
 
 def test_the_commands_print_tables(bench_set, tmp_path, capfd):
-    from tungsten_dip.buffers import write_image, write_tungsten_folder
+    from tungsten_dip.buffers.image_file import write_image
+    from tungsten_dip.buffers.write import write_tungsten_folder
 
     write_tungsten_folder(tmp_path / "set", bench_set.buffers)
     write_image(tmp_path / "set" / "reference.exr", bench_set.reference)

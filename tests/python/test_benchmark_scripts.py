@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tungsten_dip.buffers import write_image, write_tungsten_folder
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.write import write_tungsten_folder
 
 SCRIPTS = Path(__file__).parents[2] / "benchmarks"
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from commands import MAIN, SCENE, fails, write_frames, write_scene
-from tungsten_dip.buffers import Buffer, RenderBuffers, read_buffers, read_image, write_image
-from tungsten_dip.buffers.image_file import MOST_HDR
+from tungsten_dip.buffers.image_file import MOST_HDR, write_image
+from tungsten_dip.buffers.read import read_buffers, read_image
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.cli import denoising, tungsten
 from tungsten_dip.cli.scene_outputs import SceneOutputs, write_render
 from tungsten_dip.errors import InputError

@@ -13,9 +13,11 @@ import pytest
 
 import tungsten_dip
 from commands import MAIN, fails
-from tungsten_dip.buffers import Buffer, RenderBuffers, read_image, write_image, write_tungsten_folder
-from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.image_file import write_exr, write_image
+from tungsten_dip.buffers.read import read_image
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.fit.settings import FitSettings

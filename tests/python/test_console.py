@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from commands import MAIN
-from tungsten_dip.buffers import read_image, write_image
-from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.image_file import write_exr, write_image
+from tungsten_dip.buffers.read import read_image
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.cli import console, entry
 from tungsten_dip.cli import tungsten_dip as command

@@ -10,16 +10,10 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender
 from tungsten_dip import _core
-from tungsten_dip.buffers import (
-    FEATURES,
-    Buffer,
-    FloatImage,
-    RenderBuffers,
-    compare_halves,
-    prefilter_features,
-    sanitize,
-)
-from tungsten_dip.buffers.prefilter import noise_in
+from tungsten_dip.buffers.half_buffers import compare_halves
+from tungsten_dip.buffers.prefilter import noise_in, prefilter_features
+from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
 
 SIZES = [(1, 1), (1, 9), (9, 1), (7, 5), (65, 67), (0, 4), (4, 0)]
 

@@ -16,8 +16,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tungsten_dip.buffers import Buffer, RenderBuffers, image_file, read_buffers, read_image, write_image
-from tungsten_dip.buffers.read import input_files
+from tungsten_dip.buffers import image_file
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.read import input_files, read_buffers, read_image
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 
 HEIGHT, WIDTH = 5, 7

@@ -23,22 +23,13 @@ import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
-from tungsten_dip.buffers import (
-    Buffer,
-    RenderBuffers,
-    atomic,
-    check_writable,
-    image_file,
-    read_buffers,
-    read_image,
-    replacing,
-    write_denoised,
-    write_image,
-    write_text,
-    write_tungsten_folder,
-)
-from tungsten_dip.buffers.image_file import MOST_HDR, write_exr
+from tungsten_dip.buffers import atomic, image_file
+from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
+from tungsten_dip.buffers.image_file import MOST_HDR, write_exr, write_image
+from tungsten_dip.buffers.read import read_buffers, read_image
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
+from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
@@ -650,7 +641,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, suffix: str) -> None:
 import resource, sys
 from pathlib import Path
 import numpy as np
-from tungsten_dip.buffers import write_image
+from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.errors import InputError
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
@@ -824,7 +815,7 @@ def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path: Path, suffix: str, m
     room = path.stat().st_size - missing
     path.write_bytes(b"old")
     program = (
-        "import resource, signal, sys, numpy as np; from tungsten_dip.buffers import write_image\n"
+        "import resource, signal, sys, numpy as np; from tungsten_dip.buffers.image_file import write_image\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))\n"
         "write_image(sys.argv[1], np.random.default_rng(0).random((80, 90, 3)).astype(np.float32))"

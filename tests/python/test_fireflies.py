@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.fireflies import limit_fireflies
 from tungsten_dip.sequence.following import Follower

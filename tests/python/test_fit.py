@@ -15,7 +15,8 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender, relmse
 from fitted_models import check_result
-from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, write_denoised
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples

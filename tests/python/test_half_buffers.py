@@ -7,8 +7,8 @@ import pytest
 
 from conftest import SyntheticRender
 from fitted_models import DRAFT, check_result
-from tungsten_dip.buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit import denoise
 
 

@@ -14,7 +14,10 @@ from hypothesis import HealthCheck, given, settings
 
 from conftest import synthetic_render
 from hard_cases import CASES, HardCase, broken_renders, exposed, healthy, measure
-from tungsten_dip.buffers import RenderBuffers, compare_halves, prefilter_features, sanitize
+from tungsten_dip.buffers.half_buffers import compare_halves
+from tungsten_dip.buffers.prefilter import prefilter_features
+from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.onnx import infer
 

@@ -14,8 +14,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tungsten_dip.buffers import read_buffers, write_denoised
+from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings

@@ -17,7 +17,7 @@ mitsuba = pytest.importorskip("mitsuba", reason="the embedded host needs the pac
 
 import OpenImageIO  # noqa: E402
 
-from tungsten_dip.buffers import RenderBuffers  # noqa: E402
+from tungsten_dip.buffers.render_buffers import RenderBuffers  # noqa: E402
 from tungsten_dip.errors import InputError  # noqa: E402
 from tungsten_dip.hosts.mitsuba import textures  # noqa: E402
 from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402

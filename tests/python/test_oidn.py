@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from conftest import relmse
-from tungsten_dip.buffers import Buffer
+from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, oidn
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies
 
 from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, paper_model, session_of
-from tungsten_dip.buffers import Buffer
+from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.layout import Layout, Pilot

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from tungsten_dip import _core
-from tungsten_dip.buffers import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 Plain = npt.NDArray[np.float64]
 

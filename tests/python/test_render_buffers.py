@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tungsten_dip as dip
-from tungsten_dip.buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings

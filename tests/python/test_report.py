@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from browser import assert_page_works
-from tungsten_dip.buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.report.page import _features, _round_ticks, report_page

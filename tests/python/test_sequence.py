@@ -9,8 +9,8 @@ import pytest
 
 from conftest import relmse
 from moving_camera import HEIGHT, WIDTH, true_frame
-from tungsten_dip.buffers import read_buffers
 from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from moving_camera import write_frames
-from tungsten_dip.buffers import read_buffers, read_image, write_image
-from tungsten_dip.buffers.image_file import read_parts, write_exr
+from tungsten_dip.buffers.image_file import read_parts, write_exr, write_image
+from tungsten_dip.buffers.read import read_buffers, read_image
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.fit.model import source_sha256
 from tungsten_dip.fit.settings import FitSettings

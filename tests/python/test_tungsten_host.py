@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from tungsten_dip import hosts
-from tungsten_dip.buffers import read_image, write_image
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.read import read_image
 from tungsten_dip.cli.tungsten import main
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings

@@ -15,7 +15,8 @@ import pytest
 
 from conftest import SyntheticRender, relmse
 from fitted_models import DRAFT, paper_model
-from tungsten_dip.buffers import Buffer, write_tungsten_folder
+from tungsten_dip.buffers.render_buffers import Buffer
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, denoise, training

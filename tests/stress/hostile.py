@@ -16,7 +16,7 @@ from pathlib import Path
 from conftest import synthetic_render
 from kills import COMMANDS, Command, files, start, temporary_files, unreadable, write_inputs
 from row import Row
-from tungsten_dip.buffers import write_tungsten_folder
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten, tungsten_dip
 
 DISK_BYTES = (1 << 12, 1 << 14, 40 << 10)

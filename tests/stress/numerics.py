@@ -26,7 +26,7 @@ from hard_cases import (
     measure,
 )
 from row import Row
-from tungsten_dip.buffers import RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.onnx import infer

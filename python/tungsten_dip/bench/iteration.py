@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tungsten_dip.bench.machine import machine_facts
 from tungsten_dip.bench.plain_skip import PlainFit, PlainSkip
 from tungsten_dip.bench.sets import CROP_MULTIPLE
-from tungsten_dip.buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit.paper.device import compute_device
 from tungsten_dip.fit.paper.fit import PaperFit

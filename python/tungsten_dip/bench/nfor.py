@@ -13,7 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tungsten_dip.buffers import FloatImage, RenderBuffers, read_image, write_tungsten_folder
+from tungsten_dip.buffers.read import read_image
+from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.errors import InputError
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from tungsten_dip.bench.methods import NOISY, OURS
 from tungsten_dip.bench.plot import legend_html, pareto_svgs
 from tungsten_dip.bench.table import COLUMNS, SetRows, cells, repeats_text
-from tungsten_dip.buffers import FloatImage
 from tungsten_dip.buffers.relmse import relative_squared_error
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.report import html
 from tungsten_dip.report.html import Picture, View
 from tungsten_dip.report.preview import block_means, error_in_false_color

@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from tungsten_dip.buffers import FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.fit.paper.images import paper_images
 from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.settings import FitSettings

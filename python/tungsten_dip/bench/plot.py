@@ -16,7 +16,8 @@ from tungsten_dip.bench.methods import IN_TIME, NOISY, OIDN, OURS, PAPER, SAMPLE
 from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.bench.table import Row, SetRows
-from tungsten_dip.buffers import FloatImage, replacing
+from tungsten_dip.buffers.atomic import replacing
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.scene.tonemap import display_from_radiance
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from tungsten_dip.buffers import replacing
+from tungsten_dip.buffers.atomic import replacing
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.report.metrics import Comparison
 

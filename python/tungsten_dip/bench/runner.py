@@ -12,7 +12,10 @@ from tungsten_dip.bench.machine import machine_key
 from tungsten_dip.bench.methods import Method, Outcome
 from tungsten_dip.bench.results import Key, Measurement, Results
 from tungsten_dip.bench.sets import BenchSet
-from tungsten_dip.buffers import FloatImage, read_image, write_image, write_text
+from tungsten_dip.buffers.atomic import write_text
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.read import read_image
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.errors import InputError
 from tungsten_dip.interrupts import reraised_interrupts
 from tungsten_dip.progress import Progress, part_of

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers import Buffer, FloatImage, RenderBuffers, read_buffers, read_image
+from tungsten_dip.buffers.read import read_buffers, read_image
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 
 REFERENCE = "reference.exr"

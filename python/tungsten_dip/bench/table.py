@@ -8,7 +8,7 @@ import numpy as np
 
 from tungsten_dip.bench.results import Measurement
 from tungsten_dip.bench.sets import BenchSet
-from tungsten_dip.buffers import FloatImage
+from tungsten_dip.buffers.render_buffers import FloatImage
 
 COLUMNS = ("method", "seconds", "PSNR, dB", "relMSE", "FLIP", "HDR-FLIP", "mean ratio")
 

@@ -10,10 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from tungsten_dip.buffers import PLANES, FloatImage, RenderBuffers, check_writable, write_image
+from tungsten_dip.buffers.atomic import check_writable
 from tungsten_dip.buffers.display import ldr_from_feature
-from tungsten_dip.buffers.image_file import MOST_HDR, RADIANCE_SUFFIXES, radiance_suffixes, with_known_suffix
-from tungsten_dip.buffers.layers import planes_of_output
+from tungsten_dip.buffers.image_file import (
+    MOST_HDR,
+    RADIANCE_SUFFIXES,
+    radiance_suffixes,
+    with_known_suffix,
+    write_image,
+)
+from tungsten_dip.buffers.layers import PLANES, planes_of_output
+from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene.tonemap import display_from_radiance
 from tungsten_dip.scene.types import OutputBuffer, Scene, TonemapName

@@ -12,8 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tungsten_dip.buffers import check_writable, write_text
-from tungsten_dip.buffers.atomic import check_suffix
+from tungsten_dip.buffers.atomic import check_suffix, check_writable, write_text
 from tungsten_dip.buffers.read import input_files
 from tungsten_dip.cli.console import add_json, add_threads, progress_on_stderr
 from tungsten_dip.cli.denoising import (

@@ -11,14 +11,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import tungsten_dip
-from tungsten_dip.buffers import (
-    CHANNELS,
-    RenderBuffers,
-    check_writable,
-    write_denoised,
-    write_image,
-    write_text,
-)
+from tungsten_dip.buffers.atomic import check_writable, write_text
+from tungsten_dip.buffers.image_file import write_image
+from tungsten_dip.buffers.render_buffers import CHANNELS, RenderBuffers
+from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,

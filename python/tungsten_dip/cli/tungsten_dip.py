@@ -12,17 +12,11 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 
 import tungsten_dip
-from tungsten_dip.buffers import (
-    RenderBuffers,
-    check_writable,
-    read_buffers,
-    read_image,
-    write_denoised,
-    write_error_map,
-    write_text,
-)
+from tungsten_dip.buffers.atomic import check_writable, write_text
 from tungsten_dip.buffers.image_file import first_pixel
-from tungsten_dip.buffers.read import input_files
+from tungsten_dip.buffers.read import input_files, read_buffers, read_image
+from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.write import write_denoised, write_error_map
 from tungsten_dip.cli.bench import add_bench
 from tungsten_dip.cli.console import (
     Parser,
