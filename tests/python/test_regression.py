@@ -1,4 +1,4 @@
-"""The local regression through numpy: against a plain double-precision one, and what it must leave alone."""
+"""The local regression through numpy, against a plain double-precision one. (tests/cpp/ has the rest.)"""
 
 from __future__ import annotations
 
@@ -129,28 +129,6 @@ def test_agrees_with_a_plain_regression(
     np.testing.assert_allclose(out, _plain_regress(*arguments, **window), atol=2e-4)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 5), (33, 70)])
-@pytest.mark.parametrize("guided", [True, False])
-def test_a_color_linear_in_the_features_comes_out_unchanged(size: tuple[int, int], guided: bool) -> None:
-    images = _images(*size)
-    matrix = np.random.default_rng(1).uniform(-2, 2, (4, 3))
-    target = (images["features"] @ matrix + (1, 0.5, 3)).astype(np.float32)
-    guide = (images["guide"], images["guide_variance"]) if guided else (None, None)
-    features, penalty = 100 * images["features"], (1e-4,) * 4  # the ridge is nothing beside these
-    out = _core.regress(target, features, penalty, *guide, radius=5, step=1, threads=2)
-    np.testing.assert_allclose(out, target, atol=5e-4)
-
-
-@pytest.mark.parametrize("level", [0.0, 1e-6, 0.3, 1e6])
-@pytest.mark.parametrize("features", [0, 4, 16])
-def test_a_constant_comes_out_unchanged(level: float, features: int) -> None:
-    images = _images(13, 21, features)
-    target = np.full((13, 21, 3), level, np.float32)
-    guide = images["guide"], images["guide_variance"]
-    out = _core.regress(target, images["features"], (0.5,) * features, *guide, radius=4, step=1, threads=2)
-    np.testing.assert_allclose(out, target, rtol=1e-4)
-
-
 def test_repeated_and_constant_features_do_no_harm() -> None:
     images = _images(20, 30, 1)
     feature = images["features"]
@@ -160,20 +138,6 @@ def test_repeated_and_constant_features_do_no_harm() -> None:
         for image in (np.float32(8**0.5) * feature, many)
     )
     np.testing.assert_allclose(all_of_them, one, atol=1e-3)
-
-
-@pytest.mark.parametrize("step", [1, 2])
-def test_noise_falls_with_the_size_of_the_window(step: int) -> None:
-    radius = 6
-    noise = np.random.default_rng(2).standard_normal((220, 230, 3)).astype(np.float32)
-    features = np.empty((220, 230, 0), np.float32)
-    out = _core.regress(noise, features, (), radius=radius, step=step, threads=2)[12:-12, 12:-12]
-
-    def taps(step: int) -> npt.NDArray[np.float64]:
-        return np.where(np.arange(-radius, radius + 1) % step == 0, 1.0, 0.0)
-
-    both = np.convolve(taps(step), taps(1 if step == 1 else step + 1))
-    assert out.var() == pytest.approx(((both / both.sum()) ** 2).sum() ** 2, rel=0.15)
 
 
 def test_a_guide_keeps_an_edge_that_no_feature_shows() -> None:
@@ -187,18 +151,6 @@ def test_a_guide_keeps_an_edge_that_no_feature_shows() -> None:
     out = _core.regress(target, features, (), guide, noise, radius=5, step=1, threads=2)
     assert np.abs(out - truth).max() < 0.5
     assert np.square(out - truth).mean() < 0.3**2 / 20
-
-
-def test_threads_do_not_change_the_bits() -> None:
-    images = _images(37, 130, 6)
-    penalty = (0.0, 1.0, 0.0, 2.0, 0.0, 3.0)
-    one, four, again = (
-        _core.regress(images["target"], images["features"], penalty, images["guide"],
-                      images["guide_variance"], radius=6, step=2, threads=threads)
-        for threads in (1, 4, 4)
-    )  # fmt: skip
-    np.testing.assert_array_equal(one, four)
-    np.testing.assert_array_equal(four, again)
 
 
 def test_inputs_may_be_read_only_and_stay_as_they_are() -> None:
@@ -233,29 +185,6 @@ def test_what_does_not_fit_together_is_refused() -> None:
         _core.regress(target, features, penalty, guide, target, radius=1, step=1, threads=2)
     with pytest.raises(TypeError, match="target: expected an aligned C-contiguous float32"):
         _core.regress(target.astype(np.float64), features, penalty, radius=1, step=1, threads=2)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("radius", "step"), [(3, 2), (-1, 1), (2, 0), (2**31 - 1, 1), (0, 2**31 - 1)])
-def test_windows_that_cannot_be_are_refused(radius: int, step: int) -> None:
-    images = _images(4, 4)
-    with pytest.raises(ValueError, match="multiple of the step"):
-        _core.regress(images["target"], images["features"], (0.0,) * 4, radius=radius, step=step, threads=2)
-
-
-@pytest.mark.parametrize("k", [0.0, np.nan, np.inf])
-def test_numbers_that_no_weight_can_come_of_are_refused(k: float) -> None:
-    images = _images(4, 4)
-    with pytest.raises(ValueError, match="finite k above 0"):
-        _core.regress(images["target"], images["features"], (0.0,) * 4, radius=2, step=1, k=k, threads=2)
-
-
-@pytest.mark.parametrize("penalty", [np.nan, np.inf, -1.0])
-def test_penalties_that_no_weight_can_come_of_are_refused(penalty: float) -> None:
-    images = _images(4, 4)
-    with pytest.raises(ValueError, match="penalties must be finite"):
-        _core.regress(
-            images["target"], images["features"], (0.0, 0.0, 0.0, penalty), radius=2, step=1, threads=2
-        )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 5), (4, 0), (0, 4), (20, 33), (35, 18)])
