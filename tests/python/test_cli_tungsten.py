@@ -309,7 +309,7 @@ def test_several_scenes_are_frames_that_follow_one_another(tmp_path, renders, ca
     class Follower:
         def __init__(self, settings, models):
             assert settings.preset == "draft"
-            assert models.first is None
+            assert models.alone is None
 
         def denoise(self, buffers, camera, progress):
             calls.append(camera.resolution)

@@ -525,16 +525,16 @@ def test_a_frame_without_noise_makes_no_cut_of_the_next_one(make_render):
 def test_followed_frames_obey_the_settings(tmp_path):
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     first = Follower(DRAFT).denoise(frames[0].buffers).result.model
-    follower = Follower(replace(DRAFT, target_error=10.0), models=Models(first=first))
+    follower = Follower(replace(DRAFT, target_error=10.0), models=Models(alone=first))
     assert [follower.denoise(frame.buffers).result.iterations for frame in frames] == [1, 1]
     with pytest.raises(InputError, match="fitted with preset draft, this fit is to use final"):
-        Follower(FitSettings("final"), models=Models(first=first))
+        Follower(FitSettings("final"), models=Models(alone=first))
 
 
 def test_a_frame_that_was_cut_short_is_no_cut(tmp_path):
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     model = Follower(DRAFT).denoise(frames[0].buffers).result.model
-    follower = Follower(DRAFT, models=Models(first=model))
+    follower = Follower(DRAFT, models=Models(alone=model))
     follower.denoise(frames[0].buffers)
     follower._error = 1e-12  # any error is so far above it that it tells of a cut
 
@@ -607,4 +607,4 @@ def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path, monkeypatc
     model = Follower(DRAFT).denoise(frame.buffers).result.model
     without = frame.buffers.with_quantities(normal=None)
     with pytest.raises(InputError, match="the model was fitted with normal"):
-        Follower(DRAFT, models=Models(first=model)).denoise(without)
+        Follower(DRAFT, models=Models(alone=model)).denoise(without)

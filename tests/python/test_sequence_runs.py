@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from moving_camera import write_frames
+from moving_camera import true_frame, write_frames
 from tungsten_dip.buffers.image_file import read_parts, write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers, read_image
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.fit.model import source_sha256
 from tungsten_dip.fit.settings import FitSettings
@@ -310,6 +311,25 @@ def test_the_first_network_is_saved_and_used(frames, capfd):
     assert main(arguments("--frames", "1", "--warm-start", "m.onnx", "--refit", "0", "--json")) == 0
     (frame,) = told(capfd)["frames"]
     assert (frame["how"], frame["iterations"]) == ("followed", 0)
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")])
+@pytest.mark.parametrize("cameras", [True, False])
+def test_the_saved_network_is_the_first_frames_whatever_comes_after(frames, capfd, cameras, workers):
+    if workers:
+        pytest.importorskip("distributed")
+    # With cameras, frame 1 is a cut; without, it trains the first one's network further.
+    cut = true_frame(frames, 30.0, seed=1)
+    shutil.copy("camera.json", "cameras/f0001.json")
+    if cameras:
+        write_tungsten_folder(Path("noisy/f0001"), cut.buffers)
+    command = arguments("--frames", "0-2", "--refit", "auto", "--save-model", "m.onnx", "--json", *workers)
+    if not cameras:
+        command = [word for word in command if "camera" not in word]
+    assert main(command) == 0
+    records = told(capfd)["frames"]
+    assert (records[1]["how"] == "cut") == cameras
+    assert load_model("m.onnx").source_sha256 == source_sha256(read_buffers("noisy/f0000"))
 
 
 # --- Several processes ---

@@ -114,7 +114,7 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
     run = Run(settings, options.refit, dict(options.map), options.float16, digest)
     _make_writable(frames[0].output.parent, results)
-    return frames, run, Models(first=warm_start)
+    return frames, run, Models(alone=warm_start)
 
 
 def _denoised(
@@ -224,7 +224,7 @@ def _save_model(path: Path, models: Models, first: Record) -> None:
         _LOG.info("%s: left as it is: frame %d was finished before", path, first.number)
         return
     if models.first is None:
-        raise InputError(f"{path}: not written: no network was fitted, as the frames have no noise")
+        raise InputError(f"{path}: not written: no network was fitted, as frame {first.number} has no noise")
     save_model(path, models.first)
 
 

@@ -328,7 +328,7 @@ def _frame_after_frame(settings: FitSettings, warm_start: Model | None) -> Denoi
     with deferred_interrupts():
         from tungsten_dip.sequence.following import Follower, Models
 
-    follower = Follower(settings, models=Models(first=warm_start))
+    follower = Follower(settings, models=Models(alone=warm_start))
 
     def denoise(camera: Camera, buffers: RenderBuffers) -> FitResult:
         known = camera if isinstance(camera, PerspectiveCamera) else None

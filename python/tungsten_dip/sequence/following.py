@@ -48,10 +48,15 @@ _CUT_ERROR = 5.0
 
 @dataclass(frozen=True)
 class Models:
-    """The networks that frames start from: the first one's, and that of frames whose predecessor is known."""
+    """The networks that frames start from, and the first frame's own.
 
-    first: Model | None = None
+    Frames whose predecessor is known start from ``following``, others from ``alone``. ``first`` is what the
+    first frame was denoised with, None if it has no noise.
+    """
+
+    alone: Model | None = None
     following: Model | None = None
+    first: Model | None = None
 
 
 @dataclass(frozen=True)
@@ -88,12 +93,12 @@ class Follower:
         """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
 
         Raises InputError if the settings are those of the published method, which has no halves to follow,
-        ask for another network than the first one's or a device that is not there, or refit is out of range.
+        ask for another network than these or a device that is not there, or refit is out of range.
         """
         if settings.preset == "paper":
             raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
         self.models = models
-        check_ready(settings, self.models.first)
+        check_ready(settings, self.models.alone)
         self._settings = settings
         self._refit = checked_refit(refit)
         self._last: _Last | None = None
@@ -121,8 +126,10 @@ class Follower:
             how, followed = "cut", None
         if followed is None:
             followed = Followed(fit_fusion(buffers, self._settings, progress), how)
-            self.models = replace(self.models, first=followed.result.model)
+            self.models = replace(self.models, alone=followed.result.model)
         result = followed.result
+        if self._last is None:
+            self.models = replace(self.models, first=result.model)
         if result.gain is not None:
             # It is estimated from the fireflies of one frame, and would flicker.
             result = replace(result, color=result.color / result.gain, gain=None)
@@ -158,7 +165,7 @@ class Follower:
         moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
-        model = self.models.first if moved is None else self.models.following
+        model = self.models.alone if moved is None else self.models.following
         if model is not None:
             steps = _MOST_STEPS if self._refit == "auto" else self._refit
             settings = replace(self._settings, iterations=steps or None)
@@ -185,7 +192,7 @@ class Follower:
             raise _CutError(f"the error is {error / self._error:.1f} times that of the last frame with noise")
         kept = result.model or model
         if moved is None:
-            self.models = replace(self.models, first=kept)
+            self.models = replace(self.models, alone=kept)
         else:
             self.models = replace(self.models, following=kept)
         return Followed(result, "followed", None if last is None else _flicker(last, buffers, result))
