@@ -393,6 +393,29 @@ def test_a_worker_killed_within_a_frame_loses_nothing(frames, cluster):
     assert len(outputs(frames)) == COUNT
 
 
+def test_a_scheduler_that_is_lost_is_one_line_per_frame(frames, cluster):
+    from distributed import Client
+
+    with Client(cluster) as client:
+        client.wait_for_workers(2, timeout=60)
+        busy = [client.submit(time.sleep, 600, key=f"busy-{number}") for number in range(2)]
+        command = [*PROGRAM, *arguments("--scheduler", cluster)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+        def frames_wait() -> bool:
+            count = client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks))
+            return count > len(busy) or process.poll() is not None
+
+        wait_for(frames_wait)
+        os.kill(client.run_on_scheduler(os.getpid), signal.SIGKILL)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "Traceback" not in error
+    for number in range(COUNT):
+        assert f"frame {number}: the Dask scheduler that had it was lost; start one again and" in error
+    assert f"{COUNT} of {COUNT} frames without a result" in error.splitlines()[-1]
+
+
 def test_local_workers_do_what_one_does(frames, capsys):
     pytest.importorskip("distributed")
     (frames / "socket.py").write_text("open('foreign code', 'w'); raise ImportError")

@@ -36,6 +36,11 @@ _LEADS = 2
 
 _CONNECT_TIMEOUT_S = 30
 
+_LOST = (
+    "the Dask scheduler that had it was lost; start one again and repeat the command, which skips finished "
+    "frames"
+)
+
 _SAFE_PATH = "PYTHONSAFEPATH"
 
 _LOCAL_WORKERS = {
@@ -124,9 +129,10 @@ def _done(
             records, found, remarks = task.result()
             yield records, found if task is first else None, remarks
         else:
+            error = task.exception() if task.status == "error" else InputError(_LOST)
             # Frames that it had finished by then are there.
             to_do, records = split_finished(tasks[task], run)
-            yield [*records, *(failed(frame, task.exception()) for frame in to_do)], None, []
+            yield [*records, *(failed(frame, error) for frame in to_do)], None, []
 
 
 def _denoise_frames(frames: list[Frame], run: Run, models: Models) -> tuple[list[Record], Models, list[str]]:
@@ -141,7 +147,8 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
     import dask
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.ERROR)
+    for name in ("distributed", "distributed.client"):  # which logs tracebacks; it has a level of its own
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler == "local":
         with dask.config.set(_LOCAL_WORKERS), _safe_path(), ExitStack() as stack:
             try:
