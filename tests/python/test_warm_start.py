@@ -59,6 +59,21 @@ def test_a_warm_start_ends_when_the_error_falls_no_further(
     assert denoise(next_frame.buffers, warm_start=trained).settings.preset == "draft"
 
 
+def test_a_warm_start_from_memory_is_one_from_the_saved_file(
+    frame: SyntheticRender, next_frame: SyntheticRender, tmp_path: Path
+) -> None:
+    settings = replace(DRAFT, iterations=20, time_budget_s=1e9, target_error=10.0, device="cpu")
+    model = denoise(frame.buffers, settings).model
+    assert model is not None
+    save_model(tmp_path / "m.onnx", model)
+    loaded = load_model(tmp_path / "m.onnx")
+    assert model.settings == loaded.settings
+    results = [denoise(next_frame.buffers, warm_start=each) for each in (model, loaded)]
+    assert results[0].settings == results[1].settings
+    assert results[0].iterations == results[1].iterations > 1
+    np.testing.assert_array_equal(results[0].color, results[1].color)
+
+
 def test_a_warm_start_that_only_gets_worse_leaves_the_weights_as_they_were(
     model: Model, next_frame: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from tungsten_dip.buffers.render_buffers import FloatArray, RenderBuffers
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.layout import Layout
-from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings
+from tungsten_dip.fit.settings import NETWORK_SETTINGS, PAPER_SETTINGS, FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 
 Weights = dict[str, npt.NDArray[np.float32]]
@@ -28,9 +28,10 @@ class Model:
     its inputs are standardised with constants of the image that it was fitted to. The networks of the preset
     paper give the image themselves; for them ``layout`` and ``standardisation`` are None.
 
-    ``inputs`` names the network's inputs in order. ``estimated_relmse`` is the error of the fit's result.
-    ``source_sha256`` is the SHA-256 of the colour that the network was fitted to (float32, row by row),
-    ``version`` that of this package.
+    ``inputs`` names the network's inputs in order. Of the fit's ``settings``, only those that determine a
+    network are kept; the others have their defaults, as in a model that was loaded. ``estimated_relmse`` is
+    the error of the fit's result. ``source_sha256`` is the SHA-256 of the colour that the network was fitted
+    to (float32, row by row), ``version`` that of this package.
     """
 
     inputs: tuple[str, ...]
@@ -41,6 +42,10 @@ class Model:
     layout: Layout | None = None
     standardisation: Standardisation | None = None
     version: str = metadata.version("tungsten-dip")
+
+    def __post_init__(self) -> None:
+        kept = {name: getattr(self.settings, name) for name in NETWORK_SETTINGS}
+        object.__setattr__(self, "settings", FitSettings(**kept))
 
     @property
     def kind(self) -> Literal["pointwise", "skip", "resnet"]:

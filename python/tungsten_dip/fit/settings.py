@@ -15,6 +15,8 @@ Inputs = Literal["random", "normals", "depths", "albedos", "all", "all+random"]
 PAPER_SETTINGS = ("network", "inputs", "scheme", "channels")
 """What the preset ``paper`` alone leaves open."""
 
+NETWORK_SETTINGS = ("preset", "pilot", "iterations", "seed", *PAPER_SETTINGS)
+"""What determines a network; the others are where and how long it was fitted."""
 
 MOST_ITERATIONS = 10**9
 

@@ -26,7 +26,7 @@ from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import NETWORK_SETTINGS, FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx.graph import graph_of
 
@@ -38,8 +38,6 @@ _FORMAT = 5
 """Raised whenever another graph is written, or the same one has other inputs."""
 
 _PROPERTY = "tungsten_dip"
-_SETTINGS = ("preset", "pilot", "iterations", "network", "inputs", "scheme", "channels", "seed")
-"""The settings that determine a network; the others, where and how long it was fitted, are not saved."""
 
 _NO_ONNX = "expected an ONNX model, found another file or a truncated one; save it again with --save-model"
 _MOST_PARTS = 1 << 16
@@ -97,7 +95,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         "format": _FORMAT,
         "version": model.version,
         "inputs": model.inputs,
-        "settings": {name: getattr(model.settings, name) for name in _SETTINGS},
+        "settings": {name: getattr(model.settings, name) for name in NETWORK_SETTINGS},
         "estimated_relmse": model.estimated_relmse,
         "source_sha256": model.source_sha256,
     }
@@ -204,7 +202,9 @@ def _no_constant(name: str) -> None:
 def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) -> Model:
     chosen = _object("settings", facts.get("settings"))
     hints = get_type_hints(FitSettings)
-    settings = FitSettings(**{name: _checked(name, chosen.get(name), hints[name]) for name in _SETTINGS})
+    settings = FitSettings(
+        **{name: _checked(name, chosen.get(name), hints[name]) for name in NETWORK_SETTINGS}
+    )
     relmse = _checked("estimated_relmse", facts.get("estimated_relmse"), float | None)
     inputs = _checked("inputs", facts.get("inputs"), tuple[str, ...])
     version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))

@@ -55,15 +55,7 @@ def infer(
     """
     check_type("model", model, Model, "load_model reads one from a file")
     refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
-    # When to stop was a setting of the model's own fit. (A FitSettings checks the threads as well.)
-    settings = replace(
-        model.settings,
-        threads=threads,
-        iterations=refit_steps or None,
-        time_budget_s=None,
-        target_error=None,
-        device="auto",
-    )
+    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
     if model.layout is not None and refit_steps:
         return denoise(
             buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
