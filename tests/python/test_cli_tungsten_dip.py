@@ -158,6 +158,7 @@ def test_bad_buffers(spoil, folder, tmp_path, fits, capfd):
         ("{folder} -o {tmp}/out.exr --preset paper --channels 8,x", ["--channels", "integers such as"]),
         ("{folder} -o {tmp}/out.exr --map color", ["--map", "NAME=CHANNEL"]),
         ("{folder} -o {tmp}/out.exr --map beauty=x", ["beauty"]),
+        ("{folder} -o {tmp}/out.exr --map depth=z --map depth=none", ["--map depth", "z and none"]),
         ("{folder} -o {tmp}/out.exr --map color=main", ["color=main", "{folder}", "colorA.exr"]),
         ("{folder}/color.exr -o {tmp}/out.exr --map normal=N", ["normal=N", "color.exr", "R, G, B"]),
         ("{folder} -o {tmp}/out.exr --prese draft", ["--prese"]),

@@ -231,6 +231,7 @@ def test_bad_options_are_one_line(frames, capsys):
         (("--scheduler", "host"), "expected local or an address"),
         (("--frames", "x"), "expected numbers"),
         (("--preset", "paper"), "preset paper"),
+        (("--map", "depth=z", "--map", "depth=none"), "--map depth: expected one layer, got z and none"),
         (("--report", "page.txt"), "page.txt"),
     ):
         assert main(arguments(*more)) == 2

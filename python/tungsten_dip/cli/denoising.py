@@ -64,6 +64,19 @@ def add_file_options(parser: argparse._ActionsContainer) -> None:
     add("--half", dest="float16", action="store_true", help="write 16-bit floats")
 
 
+def layer_mapping(options: argparse.Namespace) -> dict[str, str]:
+    """Return what ``--map`` settles: the layer by the name of what it is taken for.
+
+    Raises InputError if a name is given twice.
+    """
+    mapping: dict[str, str] = {}
+    for name, channel in options.map:
+        if name in mapping:
+            raise InputError(f"--map {name}: expected one layer, got {mapping[name]} and {channel}; omit one")
+        mapping[name] = channel
+    return mapping
+
+
 def fit_settings(
     options: argparse.Namespace, names: Sequence[str], warm_start: Model | None = None
 ) -> FitSettings:

@@ -21,6 +21,7 @@ from tungsten_dip.cli.denoising import (
     add_fit_options,
     check_no_input,
     fit_settings,
+    layer_mapping,
     load_warm_start,
 )
 from tungsten_dip.cores import MOST_THREADS
@@ -104,7 +105,8 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
         )
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
-    check_no_input((frame.output for frame in frames), set(_input_files(frames, dict(options.map))))
+    mapping = layer_mapping(options)
+    check_no_input((frame.output for frame in frames), set(_input_files(frames, mapping)))
     results = [(frames[0].output, ".exr"), (options.report, ".html"), (options.save_model, ".onnx")]
     for file, suffix in results:
         if file is not None:
@@ -112,7 +114,7 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
-    run = Run(settings, options.refit, dict(options.map), options.float16, digest)
+    run = Run(settings, options.refit, mapping, options.float16, digest)
     _make_writable(frames[0].output.parent, results)
     return frames, run, Models(alone=warm_start)
 

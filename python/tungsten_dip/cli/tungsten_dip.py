@@ -37,6 +37,7 @@ from tungsten_dip.cli.denoising import (
     check_no_input,
     denoise_with_progress,
     fit_settings,
+    layer_mapping,
     load_warm_start,
     write_model,
 )
@@ -183,13 +184,14 @@ def _denoised(
     if options.error_map is not None and options.error_map.resolve() == options.output.resolve():
         raise InputError(f"{options.error_map}: named for the picture and for the error map; name two files")
 
-    inputs = [file.resolve() for file in input_files(options.input, dict(options.map))]
+    mapping = layer_mapping(options)
+    inputs = [file.resolve() for file in input_files(options.input, mapping)]
     # One file that holds everything may be replaced: the result passes all of its layers through.
     is_whole = inputs == [options.input.resolve()]
     check_no_input([options.error_map] if is_whole else [options.output, options.error_map], inputs)
 
     with remarks_from_log() as remarks:
-        buffers = read_buffers(options.input, dict(options.map))
+        buffers = read_buffers(options.input, mapping)
         result = denoise(buffers)
     write_denoised(options.output, result, buffers, float16=options.float16)
     if options.report is not None:
