@@ -145,7 +145,7 @@ def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None
         output = network(torch.from_numpy(shown.transpose(2, 0, 1)[None].copy()))[0].permute(1, 2, 0).numpy()
     np.testing.assert_allclose(result.color, radiance_from_ldr(output), rtol=1e-3)
     assert result.estimated_relmse is None
-    with pytest.raises(InputError, match="neither candidates nor refit"):
+    with pytest.raises(InputError, match="expected 0 steps of a network of preset paper, got 1"):
         infer(fit, frame.buffers, refit_steps=1)
 
 

@@ -210,6 +210,39 @@ def test_numbers_that_infer_cannot_take_are_told_before_anything_is_read(
     assert f"tungsten-dip: {told}expected" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "installed", "told"),
+    [
+        (["denoise", "--warm-start", "{plain}", "--pilot", "oidn"], True, "fitted with pilot none"),
+        (["denoise", "--pilot", "oidn"], False, "needs pyoidn"),
+        (["infer", "{oidn}"], False, "needs pyoidn"),
+        (["infer", "{paper}", "--refit", "5"], True, "expected 0 steps of a network of preset paper"),
+    ],
+)
+def test_what_needs_no_input_is_checked_before_it_is_read(
+    arguments: list[str],
+    installed: bool,
+    told: str,
+    model: Model,
+    frame: SyntheticRender,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    models = {
+        "plain": model,
+        "oidn": replace(model, settings=replace(model.settings, pilot="oidn")),
+        "paper": paper_model("resnet", frame.buffers),
+    }
+    paths = {name: tmp_path / f"{name}.onnx" for name in models}
+    for name, each in models.items():
+        save_model(paths[name], each)
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: object() if installed else None)
+    words = [word.format(**paths) for word in arguments]
+    assert command.main([*words, "missing", "-o", str(tmp_path / "out.exr")]) == 2
+    assert told in capfd.readouterr().err
+
+
 def test_save_and_warm_start_on_the_command_line(
     tmp_path: Path, frame: SyntheticRender, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -43,8 +43,10 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettings, Inputs, Preset
+from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.report.page import report_page
 from tungsten_dip.scene.effects import inspect_facts, inspect_text
@@ -152,6 +154,7 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     warm_start = load_warm_start(options)
     names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
     settings = fit_settings(options, names, warm_start)
+    check_ready(settings, warm_start)
     return _denoised(
         options, settings.preset, lambda buffers: denoise_with_progress(buffers, settings, warm_start)
     )
@@ -159,8 +162,11 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     whole_number("--refit", options.refit, 0, MOST_ITERATIONS)
+    with deferred_interrupts():
+        from tungsten_dip.onnx.inference import inference_settings
+
     model = tungsten_dip.load_model(options.model)
-    replace(model.settings, threads=options.threads)  # which checks them, before anything is read
+    inference_settings(model, options.threads, options.refit)  # which checks them, before anything is read
 
     def infer(buffers: RenderBuffers) -> FitResult:
         with progress_on_stderr("denoising") as progress:

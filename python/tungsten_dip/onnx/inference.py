@@ -11,7 +11,7 @@ from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
-from tungsten_dip.fit import denoise
+from tungsten_dip.fit import check_ready, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
@@ -54,8 +54,7 @@ def infer(
     refit_steps cannot be done.
     """
     check_type("model", model, Model, "load_model reads one from a file")
-    refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
-    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
+    settings = inference_settings(model, threads, refit_steps)
     if model.layout is not None and refit_steps:
         return denoise(
             buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
@@ -64,10 +63,26 @@ def infer(
     if model.layout is not None:
         result = infer_fusion(model, known.buffers, settings, progress, known.candidates, known.previous)
     else:
-        if refit_steps or known.candidates or known.previous is not None:
-            raise InputError("a network of the preset paper takes neither candidates nor refit steps")
+        if known.candidates or known.previous is not None:
+            raise InputError("a network of the preset paper takes no candidates")
         result = _infer_paper(model, known.buffers, settings, progress)
     return completed(result, known)
+
+
+def inference_settings(model: Model, threads: int | None, refit_steps: int) -> FitSettings:
+    """Return the settings that a model is used with, for the arguments of `infer`.
+
+    Raises InputError if these cannot be done, or a package is missing.
+    """
+    refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
+    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
+    if model.layout is not None:
+        check_ready(settings)
+    elif refit_steps:
+        raise InputError(
+            f"refit: expected 0 steps of a network of preset paper, got {refit_steps}; fit from it instead"
+        )
+    return settings
 
 
 def infer_fusion(
