@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fitted_models import paper_model
 from moving_camera import true_frame, write_frames
 from tungsten_dip.buffers.image_file import read_parts, write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers, read_image
@@ -23,7 +24,7 @@ from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli.tungsten_dip import main
 from tungsten_dip.fit.model import source_sha256
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.onnx import load_model
+from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.sequence import work
 from tungsten_dip.sequence.frames import find_frames
 
@@ -230,7 +231,7 @@ def test_bad_options_are_one_line(frames, capsys):
         (("--refit", "some"), "expected auto, 0 or a number"),
         (("--scheduler", "host"), "expected local or an address"),
         (("--frames", "x"), "expected numbers"),
-        (("--preset", "paper"), "preset paper"),
+        (("--preset", "paper"), "invalid choice: 'paper'"),
         (("--map", "depth=z", "--map", "depth=none"), "--map depth: expected one layer, got z and none"),
         (("--report", "page.txt"), "page.txt"),
     ):
@@ -570,8 +571,9 @@ def test_json_tells_of_the_frames_that_are_done_where_others_are_not(frames, cap
 
 def test_the_published_method_is_refused_before_a_worker_starts(frames, capsys):
     pytest.importorskip("distributed")
-    command = [word if word != "draft" else "paper" for word in arguments("--workers", "2")]
-    assert main(command) == 2
+    save_model("paper.onnx", paper_model("resnet", read_buffers("noisy/f0000")))
+    given = arguments("--workers", "2", "--warm-start", "paper.onnx")
+    assert main([word for word in given if word not in ("--preset", "draft")]) == 2
     err = capsys.readouterr().err
     assert "preset paper" in err.splitlines()[-1]
     assert "Traceback" not in err

@@ -26,11 +26,13 @@ MAP_HELP = "take this layer of the input for color, albedo, normal, depth, color
 REPORT_HELP = "write a page with the pictures, the error and what led to them"
 
 
-def add_fit_options(parser: argparse._ActionsContainer, prefix: str) -> None:
+def add_fit_options(
+    parser: argparse._ActionsContainer, prefix: str, presets: Sequence[str] = get_args(Preset)
+) -> None:
     """Add the options of a fit that both commands have, as ``--{prefix}preset`` and so on."""
     add, flag = parser.add_argument, f"--{prefix}"
     devices = get_args(get_type_hints(FitSettings)["device"])
-    add(f"{flag}preset", dest="preset", choices=get_args(Preset), help="how to fit (default: balanced)")
+    add(f"{flag}preset", dest="preset", choices=presets, help="how to fit (default: balanced)")
     pilots = get_args(get_type_hints(FitSettings)["pilot"])
     add(f"{flag}pilot", dest="pilot", choices=pilots, help="another denoiser to choose from (default: none)")
     add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=_budget, help="end after 90s, 5m, ...")

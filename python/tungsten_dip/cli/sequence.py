@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from tungsten_dip.buffers.atomic import check_suffix, check_writable, write_text
 from tungsten_dip.buffers.read import input_files
@@ -26,6 +26,7 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.fit.settings import Preset
 from tungsten_dip.interrupts import deferred_interrupts
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
+_PRESETS = tuple(preset for preset in get_args(Preset) if preset != "paper")
+"""Frames of the published method do not follow one another."""
 
 _TOLD_OF_EVERY_FRAME = tuple(
     f"tungsten_dip.{name}" for name in ("buffers", "fit", "onnx", "sequence.cluster")
@@ -58,7 +61,7 @@ def add_sequence(commands: _SubParsersAction[Any]) -> None:
     add("--refit", metavar="auto|N|0", type=_refit, default="auto", help=_REFIT_HELP)
     add("--scheduler", metavar="local|tcp://...", default="local", help="a Dask scheduler that runs already")
     add("--workers", metavar="N", type=int, help="how many local processes at most (default: 1)")
-    add_fit_options(sequence, prefix="")
+    add_fit_options(sequence, prefix="", presets=_PRESETS)
     add_file_options(sequence)
     add("--report", metavar="R.html", type=Path, help="write a page with the frames, their time and error")
     add_threads(sequence)
