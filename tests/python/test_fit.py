@@ -20,6 +20,7 @@ from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, fusion, training
 from tungsten_dip.fit.evidence import pilots_of_all_samples
+from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -31,6 +32,7 @@ from tungsten_dip.fit.pointwise import Examples
 from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.surfaces import Surfaces, surfaces_of_halves
 from tungsten_dip.fit.training import Training, _batches
+from tungsten_dip.progress import silent
 
 
 def _settings(**changes: Any) -> FitSettings:
@@ -258,46 +260,33 @@ def test_the_halves_of_the_result_are_what_its_mean_is_made_of(render: Synthetic
     assert (result.halves[0] != result.halves[1]).any()
 
 
-def test_a_good_candidate_is_chosen(render: SyntheticRender) -> None:
+@pytest.fixture
+def oidn_images(monkeypatch: pytest.MonkeyPatch) -> list[FloatImage]:
+    """Images of both halves that another denoiser is to return, in the units of the render."""
+    images: list[FloatImage] = []
+    monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: object())
+    monkeypatch.setattr(
+        "tungsten_dip.fit.evidence.oidn_pilot",
+        lambda buffers, colors, scale, threads: tuple(image * np.float32(scale) for image in images),
+    )
+    return images
+
+
+def test_a_good_candidate_is_chosen(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
     alone = denoise(render.buffers, _settings())
     truth = render.reference
-    together = denoise(render.buffers, _settings(), candidates=[(truth, truth)])
+    oidn_images[:] = truth, truth
+    together = denoise(render.buffers, _settings(pilot="oidn"))
     check_result(together, render.buffers)
     assert relmse(together.color, truth) < relmse(alone.color, truth) / 2
 
 
-def test_a_bad_candidate_does_little_harm(render: SyntheticRender) -> None:
+def test_a_bad_candidate_does_little_harm(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
     alone = denoise(render.buffers, _settings(iterations=80))
-    wrong = np.full_like(render.reference, -1.0)
-    together = denoise(render.buffers, _settings(iterations=80), candidates=[(wrong, 10 * render.reference)])
+    oidn_images[:] = np.zeros_like(render.reference), 10 * render.reference
+    together = denoise(render.buffers, _settings(iterations=80, pilot="oidn"))
     check_result(together, render.buffers)
     assert relmse(together.color, render.reference) < 1.3 * relmse(alone.color, render.reference)
-
-
-def test_candidates_without_halves_are_noted(render: SyntheticRender) -> None:
-    truth = render.reference
-    buffers = render.buffers.with_quantities(color=Buffer(render.buffers.color.mean))
-    result = denoise(buffers, _settings(), candidates=[(truth, truth)])
-    assert any(note.startswith("the candidates are not used") for note in result.notes)
-    np.testing.assert_array_equal(result.color, denoise(buffers, _settings()).color)
-
-
-@pytest.mark.parametrize(
-    ("candidates", "message"),
-    [
-        ([(np.zeros((40, 56, 3)), np.zeros((56, 40, 3)))], "candidate 0, half B: expected shape"),
-        ([(np.zeros((40, 56, 3)),)], "candidate 0: expected a pair"),
-        ([None], "candidate 0: expected a pair"),
-        (np.float32(5), "candidates: expected Sequence"),
-        ([(np.full((40, 56, 3), np.nan), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
-        ([(np.full((40, 56, 3), 1e300), np.zeros((40, 56, 3)))], "candidate 0, half A: expected finite"),
-    ],
-)
-def test_candidates_that_cannot_be_used_are_refused(
-    candidates: Any, message: str, render: SyntheticRender
-) -> None:
-    with pytest.raises(InputError, match=message):
-        denoise(render.buffers, _settings(), candidates=candidates)
 
 
 def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:
@@ -653,7 +642,7 @@ def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
     known = reference.copy()
     known[height // 2 :] = np.nan
     settings = FitSettings(preset="draft", threads=1)
-    result = denoise(buffers, settings, previous=(known, known))
+    result = fit_fusion(buffers, settings, silent, previous=(known, known))
     alone = denoise(buffers, settings)
     assert np.isfinite(result.color).all()
     assert result.model.layout.candidate_count == 1
@@ -678,15 +667,10 @@ def test_empty_space_stays_black_whatever_the_previous_frame_shows(render):
     nothing = np.where(empty[:, :, None], np.float32(0), depth.mean)
     buffers = replace(buffers, color=Buffer((a + b) / 2, a, b), depth=Buffer(nothing))
     bright = np.full_like(render.reference, 2.0)
-    result = denoise(buffers, FitSettings(preset="draft", threads=1), previous=(bright, bright))
+    settings = FitSettings(preset="draft", threads=1)
+    result = fit_fusion(buffers, settings, silent, previous=(bright, bright))
     assert not result.color[:17, :17].any()
     assert result.color[~empty].any()
-
-
-def test_a_previous_frame_of_another_size_is_refused(render):
-    wrong = np.zeros((3, 4, 3), np.float32)
-    with pytest.raises(InputError, match="previous, half A: expected shape"):
-        denoise(render.buffers, FitSettings(preset="draft"), previous=(wrong, wrong))
 
 
 @pytest.mark.parametrize(("pixels", "size"), [(1, 16), (10, 4), (10, 7), (50, 1000)])

@@ -16,12 +16,15 @@ from fitted_models import DRAFT, paper_model, session_of
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
+from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pointwise import Examples, first_weights
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import infer, inference
 from tungsten_dip.onnx.file import proto_from_model
+from tungsten_dip.onnx.inference import infer_fusion
+from tungsten_dip.progress import silent
 
 torch = pytest.importorskip("torch")
 
@@ -217,9 +220,9 @@ def test_without_halves_the_noise_is_split(model: Model, frame: SyntheticRender)
 
 def test_candidates_reach_the_network(frame: SyntheticRender) -> None:
     truth = frame.reference
-    fit = denoise(frame.buffers, DRAFT, candidates=[(truth, truth)])
+    fit = fit_fusion(frame.buffers, DRAFT, silent, previous=(truth, truth))
     assert fit.model is not None
-    inferred = infer(fit.model, frame.buffers, threads=1, candidates=[(truth, truth)])
+    inferred = infer_fusion(fit.model, frame.buffers, DRAFT, silent, previous=(truth, truth))
     np.testing.assert_allclose(inferred.color, fit.color, rtol=1e-5)
     with pytest.raises(InputError, match=r"fitted with 1 candidates .*, this input comes with 0"):
         infer(fit.model, frame.buffers)

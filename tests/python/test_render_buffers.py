@@ -111,8 +111,6 @@ def test_what_is_of_another_type_is_refused(call, words):
         ("half_a", lambda image, _: Buffer(GREY, image, GREY)),
         ("alpha", lambda image, _: RenderBuffers(Buffer(GREY), alpha=image)),
         ("spp", lambda image, _: RenderBuffers(Buffer(GREY), spp=image)),
-        ("candidate 0, half B", lambda image, _: dip.denoise(NOISY, candidates=[(GREY, image)])),
-        ("previous, half A", lambda image, _: dip.denoise(NOISY, previous=(image, GREY))),
         ("image", lambda image, _: dip.compare(image, GREY)),
         ("reference", lambda image, _: dip.compare(GREY, image)),
         ("a.png", lambda image, folder: dip.write_image(folder / "a.png", image)),

@@ -16,7 +16,7 @@ def _gamma_noise(shape: float) -> RenderBuffers:
 def test_the_halves_of_gamma_noise_are_independent_and_as_noisy_as_real_ones() -> None:
     for shape in (1.0, 4.0, 30.0):
         buffers = _gamma_noise(shape)
-        halved = with_independent_halves(buffers, (), 0, 1)
+        halved = with_independent_halves(buffers, 0, 1)
         assert halved.drawn
         assert "no half buffers" in halved.notes[0]
         assert halved.buffers.color.halves is not None
@@ -32,7 +32,7 @@ def test_other_seeds_and_images_are_split_otherwise() -> None:
     other = RenderBuffers(Buffer(np.ascontiguousarray(buffers.color.mean[::-1])))
 
     def share(image: RenderBuffers, seed: int) -> np.ndarray:
-        half = with_independent_halves(image, (), seed, 1).buffers.color.half_a
+        half = with_independent_halves(image, seed, 1).buffers.color.half_a
         assert half is not None
         return half / image.color.mean
 
@@ -48,7 +48,7 @@ def test_one_half_alone_has_a_firefly() -> None:
         for place in ((10, 12), (0, 12), (0, 0)):
             color[place] = value
         for seed in range(30):
-            halves = with_independent_halves(RenderBuffers(Buffer(color)), (), seed, 1).buffers.color.halves
+            halves = with_independent_halves(RenderBuffers(Buffer(color)), seed, 1).buffers.color.halves
             assert halves is not None
             for place in ((10, 12), (0, 12), (0, 0)):
                 pixels = sorted(half[place].tolist() for half in halves)
@@ -57,7 +57,7 @@ def test_one_half_alone_has_a_firefly() -> None:
 
 def test_what_has_no_noise_is_not_torn_apart() -> None:
     flat = RenderBuffers(Buffer(np.full((20, 30, 3), 0.7, np.float32)))
-    halves = with_independent_halves(flat, (), 0, 1).buffers.color.halves
+    halves = with_independent_halves(flat, 0, 1).buffers.color.halves
     assert halves is not None
     for half in halves:
         np.testing.assert_allclose(half, 0.7, rtol=1e-3)
@@ -67,7 +67,7 @@ def test_emitted_light_is_split_as_the_colour_is() -> None:
     color = np.random.default_rng(5).gamma(2, 0.5, (40, 40, 3)).astype(np.float32)
     albedo = np.full_like(color, 0.5)
     color[10:20, 10:20] = albedo[10:20, 10:20] = 9
-    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1).buffers
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), 0, 1).buffers
     assert split.color.halves is not None
     assert split.albedo is not None
     assert split.albedo.halves is not None
@@ -82,7 +82,7 @@ def test_noise_of_each_channel_is_split_as_it_is_correlated() -> None:
     for independent in (True, False):
         noise = rng.gamma(4, 1 / 4, (90, 120, 3 if independent else 1))
         noisy = RenderBuffers(Buffer((color * noise).astype(np.float32)))
-        split = with_independent_halves(noisy, (), 0, 2).buffers
+        split = with_independent_halves(noisy, 0, 2).buffers
         assert split.color.halves is not None
         a, b = (half / color - 1 for half in split.color.halves)
         for first in range(3):
@@ -106,7 +106,7 @@ def test_lamps_in_plain_view_are_in_both_halves_and_stray_light_is_not() -> None
     stray = (emitted == 100) & ~lamps
     color, albedo = ((emitted + base)[:, :, None].repeat(3, axis=2) for base in (0.2, 0.5))
     albedo[emitted > 0] += 0.5
-    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), (), 0, 1).buffers
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), 0, 1).buffers
     assert split.color.half_a is not None
     share = (split.color.half_a / (2 * color)).mean(axis=2)
     torn = (share < 0.1) | (share > 0.9)

@@ -20,8 +20,10 @@ from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, denoise, training
+from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx import infer, load_model, save_model
+from tungsten_dip.progress import silent
 
 
 def test_a_warm_start_starts_from_the_weights_and_constants(
@@ -139,7 +141,7 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
     with pytest.raises(InputError, match="fitted with preset draft, this fit is to use balanced"):
         denoise(buffers, replace(DRAFT, preset="balanced"), warm_start=model)
     with pytest.raises(InputError, match=r"fitted with 0 candidates .*, this input comes with 1"):
-        denoise(buffers, DRAFT, candidates=[(frame.reference, frame.reference)], warm_start=model)
+        fit_fusion(buffers, DRAFT, silent, model, previous=(frame.reference, frame.reference))
 
     paper = paper_model("skip", buffers)
     with pytest.raises(InputError, match="fitted with preset paper, this fit is to use draft"):
@@ -150,20 +152,6 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
         denoise(buffers, replace(paper.settings, channels=(4, 6)), warm_start=paper)
     with pytest.raises(InputError, match=r"lacks normal mean 0"):
         infer(paper, without)
-
-
-def test_a_model_that_chooses_among_candidates_needs_independent_halves(frame: SyntheticRender) -> None:
-    candidates = [(frame.reference, frame.reference)]
-    model = denoise(frame.buffers, DRAFT, candidates=candidates).model
-    assert model is not None
-    color = frame.buffers.color
-    without_halves = frame.buffers.with_quantities(color=Buffer(color.mean))
-    for attempt in (
-        lambda: infer(model, without_halves, threads=1, candidates=candidates),
-        lambda: denoise(without_halves, DRAFT, candidates=candidates, warm_start=model),
-    ):
-        with pytest.raises(InputError, match="cannot be judged without independent halves; fit without"):
-            attempt()
 
 
 WITHOUT_EXTRAS = """

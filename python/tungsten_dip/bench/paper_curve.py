@@ -43,7 +43,7 @@ def paper_curve(
     sampling_s = 0.0
     points = []
     total = max(checkpoints)
-    buffers = prepared(buffers, threads=settings.threads).buffers
+    buffers = prepared(buffers, settings.threads).buffers
     with compute_device(settings) as device:
         fit = PaperFit(paper_images(buffers, settings), settings, device)
         for iteration in range(1, total + 1):

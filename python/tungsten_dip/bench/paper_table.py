@@ -129,7 +129,7 @@ def run_paper_table(
         whole_number("rows", number, 1, len(published))
     iterations = whole_number("iterations", iterations, 1, MOST_ITERATIONS)
     runner = Runner(folder, threads)
-    buffers = prepared(bench_set.buffers, threads=threads).buffers
+    buffers = prepared(bench_set.buffers, threads).buffers
     chosen = [
         row
         for row in published

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
-from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.errors import check_type
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.preparation import completed, prepared
@@ -46,9 +45,7 @@ def denoise(
     settings: FitSettings | None = None,
     progress: Progress = silent,
     *,
-    candidates: Sequence[Halves] = (),
     warm_start: Model | None = None,
-    previous: Halves | None = None,
 ) -> FitResult:
     """Denoise one image, fitting a network to it and to nothing else.
 
@@ -57,21 +54,12 @@ def denoise(
     threads and machine give the same bits, but for a time budget. Ctrl-C once the network is in training ends
     the fit early with the image reached so far.
 
-    ``candidates`` are further estimates of the clean image that the caller supplies (another denoiser's
-    images, for example): pairs of linear radiance in the shape of the colour, one image computed from half A
-    of the samples alone and one from half B alone. The network chooses among them and its own pilots. They
-    are not used without independent halves, which are then drawn from the image (`fit.splitting`).
-
-    ``previous`` are the halves of the previous frame's result, reprojected to this frame, NaN where they have
-    no value. They are a candidate and a guide, with which fewer pilots are needed.
-
     With ``warm_start`` (of an earlier frame, for example) the network starts from the model's weights, with
     its pilots and constants, and trains until the error estimated from the halves falls no further, for at
     most ``settings.iterations`` steps. Without settings, those of the model hold, but for the iterations.
 
     Raises InputError if the image is empty, what the settings require is missing (a buffer, a device, torch
-    for the preset paper), candidates are of another shape or not finite, or the model does not fit the image
-    or the settings.
+    for the preset paper), or the model does not fit the image or the settings.
     """
     if warm_start is not None:
         check_type("warm_start", warm_start, Model, "load_model reads one from a file")
@@ -79,10 +67,8 @@ def denoise(
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     check_type("settings", settings, FitSettings, "use FitSettings(preset=...)")
     check_ready(settings, warm_start)
-    known = prepared(buffers, candidates, previous, settings.threads)
+    known = prepared(buffers, settings.threads)
     if settings.preset == "paper":
-        if known.candidates or known.previous is not None:
-            raise InputError("candidates: expected none with the preset paper, which fits the colour alone")
         with deferred_interrupts():
             from tungsten_dip.fit.paper.fit import fit_paper
 
@@ -91,5 +77,5 @@ def denoise(
         with deferred_interrupts():
             from tungsten_dip.fit.fusion import fit_fusion
 
-        result = fit_fusion(known.buffers, settings, progress, known.candidates, warm_start, known.previous)
+        result = fit_fusion(known.buffers, settings, progress, warm_start)
     return completed(result, known)

@@ -133,14 +133,13 @@ def evidence_from_buffers(
     halves = limited.halves
     surfaces = surfaces_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
-    candidates = [_scaled_halves(pair, scale) for pair in image.candidates]
+    candidates: list[Halves] = []
     if settings.pilot == "oidn":
-        # The last of them: `pilots_of_all_samples` relies on it.
         a, b = oidn_pilot(buffers, halves, scale, threads)
         candidates.append((a, b))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, surfaces[0], len(candidates) + (previous is not None), image.drawn)
+        _check_fits(layout, surfaces[0], len(candidates) + (previous is not None))
 
     occupied = _occupied(halves, buffers, threads)
     guides, known, filled = _guides(halves, surfaces, previous, scale, occupied)
@@ -222,7 +221,7 @@ def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:
 
 
 def _scaled_halves(halves: Halves, scale: float) -> Halves:
-    """Return candidates of linear radiance in the units of the evidence."""
+    """Return linear radiance in the units of the evidence."""
     a, b = (np.maximum(scaled(half, scale), 0) for half in halves)
     return a, b
 
@@ -250,16 +249,14 @@ def pilots_of_all_samples(
     guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
     maker = PilotMaker(colors, surfaces, guides, variance)
     occupied = _occupied(evidence.halves, buffers, evidence.threads)
-    pilots = evidence.layout.pilots
     computed = []
-    for pilot in pilots:
+    for pilot in evidence.layout.pilots:
         if given_up is not None and given_up.is_set():
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
-    candidates = [mean_of(candidate) for candidate in evidence.choices[1 + len(pilots) :]]
     if settings.pilot == "oidn":
-        (candidates[-1],) = oidn_pilot(buffers, colors, evidence.scale, evidence.threads)
-    return (evidence.mean, *computed, *candidates)
+        computed.extend(oidn_pilot(buffers, colors, evidence.scale, evidence.threads))
+    return (evidence.mean, *computed)
 
 
 def with_best_baseline(evidence: Evidence) -> Evidence:
@@ -289,23 +286,17 @@ def _noises(errors_of_baseline: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, surfaces: Surfaces, candidate_count: int, drawn: bool) -> None:
+def _check_fits(layout: Layout, surfaces: Surfaces, candidate_count: int) -> None:
     unknown = [n for n in layout.features if n not in surfaces.names and n not in surfaces.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
         )
-    if layout.candidate_count > candidate_count and drawn:
-        raise InputError(
-            "the model chooses among candidates, which cannot be judged without independent halves; fit "
-            "without the model"
-        )
     if layout.candidate_count != candidate_count:
         raise InputError(
-            f"the model was fitted with {layout.candidate_count} candidates (other denoisers' images or the "
-            f"previous frame), this input comes with {candidate_count}; give as many, or fit without the "
-            f"model"
+            f"the model was fitted with {layout.candidate_count} candidates (Open Image Denoise's image, the "
+            f"previous frame), this input comes with {candidate_count}; fit without the model"
         )
 
 

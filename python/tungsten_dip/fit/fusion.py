@@ -8,7 +8,6 @@ preserved.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
@@ -73,16 +72,20 @@ def fit_fusion(
     buffers: RenderBuffers,
     settings: FitSettings,
     progress: Progress,
-    candidates: Sequence[Halves] = (),
     warm_start: Model | None = None,
     previous: Halves | None = None,
 ) -> FitResult:
-    """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`."""
+    """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`.
+
+    ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
+    the shape of the colour, NaN where they have no value. They are a candidate and a guide, with which fewer
+    pilots are needed.
+    """
     clock = Clock(settings.time_budget_s)
     unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
         return unchanged
-    halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
+    halved = with_independent_halves(buffers, settings.seed, settings.threads)
     following = previous is not None
     preset = _preset(settings, following)
     layout = None if warm_start is None else warm_start.layout

@@ -32,7 +32,7 @@ class Layout:
     """The inputs of a network and the images it chooses among: the same for every image that it is used on.
 
     ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
-    filters compute, then the candidates: the caller's, Open Image Denoise's, the previous frame.
+    filters compute, then the candidates: Open Image Denoise's image, the previous frame.
     ``baseline`` is the index of the pilot that the others are compared with.
     """
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
-from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
-from tungsten_dip.fit.candidates import checked_candidates, checked_previous
 from tungsten_dip.fit.result import FitResult
 
 _LOG = logging.getLogger(__name__)
@@ -29,26 +27,16 @@ _UNSEEN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Prepared:
-    """Sanitised buffers, images that the caller supplies, and notes on repaired values."""
+    """Sanitised buffers, and notes on repaired values."""
 
     buffers: RenderBuffers
-    candidates: tuple[Halves, ...]
-    previous: Halves | None
     notes: tuple[str, ...]
 
 
-def prepared(
-    buffers: RenderBuffers,
-    candidates: Sequence[Halves] = (),
-    previous: Halves | None = None,
-    threads: int | None = None,
-) -> Prepared:
-    """Check and sanitise the input; the arguments are those of `tungsten_dip.denoise`.
+def prepared(buffers: RenderBuffers, threads: int | None = None) -> Prepared:
+    """Check and sanitise the input; an albedo in another scale is left out.
 
-    An albedo in another scale is left out.
-
-    Raises InputError if these are no buffers or the image is empty, or candidates are of another shape or not
-    finite.
+    Raises InputError if these are no buffers or the image is empty.
     """
     check_type("buffers", buffers, RenderBuffers, "read_buffers reads them from files")
     if buffers.color.mean.size == 0:
@@ -57,12 +45,10 @@ def prepared(
         _LOG.warning(
             "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
-    given = checked_candidates(buffers, candidates)
-    previous = checked_previous(buffers, previous)
     buffers, foreign = without_foreign_halves(buffers)
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
-    return Prepared(buffers, given, previous, (*foreign, *repaired))
+    return Prepared(buffers, (*foreign, *repaired))
 
 
 def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:

@@ -10,7 +10,6 @@ needs.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,42 +49,37 @@ _LARGEST_SHAPE = 1e8
 
 @dataclass(frozen=True)
 class HalvedImage:
-    """Sanitised buffers whose colour has independent halves, and the candidates that these can score.
+    """Sanitised buffers whose colour has independent halves.
 
     ``drawn`` indicates that the halves were drawn from the image; ``notes`` give the reason.
     """
 
     buffers: RenderBuffers
-    candidates: tuple[Halves, ...] = ()
     drawn: bool = False
     notes: tuple[str, ...] = ()
 
 
-def with_independent_halves(
-    buffers: RenderBuffers, candidates: Sequence[Halves], seed: int, threads: int | None
-) -> HalvedImage:
+def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int | None) -> HalvedImage:
     """Return sanitised buffers with independent halves of the colour.
 
     Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is estimated
-    from the difference of pixels and their surroundings. Then no candidate can be used: it was computed from
-    the noise of both halves. The same image and seed give the same halves, whatever the exposure.
+    from the difference of pixels and their surroundings. The same image and seed give the same halves,
+    whatever the exposure.
     """
     color = buffers.color
     test = compare_halves(buffers, threads)
     # Tiny or uniform images cannot be tested: their halves are used unless they are copies.
     untestable = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
     if test.independent or untestable:
-        return HalvedImage(buffers, tuple(candidates))
+        return HalvedImage(buffers)
     emitted = np.zeros_like(color.mean)
     if buffers.albedo is not None:
         emitted = np.maximum(buffers.albedo.mean - 1, 0)
     share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
-    notes = [
+    note = (
         f"{_why(buffers, test)}: its noise, estimated from the surrounding pixels, is split at random into "
         f"two; the estimated error may be too low"
-    ]
-    if candidates:
-        notes.append("the candidates are not used: they were computed from the noise of both halves")
+    )
     split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
     albedo = buffers.albedo
     if albedo is not None and emitted.any():
@@ -94,7 +88,7 @@ def with_independent_halves(
         half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
         variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
         split["albedo"] = Buffer(albedo.mean, half_a, half_b, variance)
-    return HalvedImage(buffers.with_quantities(**split), drawn=True, notes=tuple(notes))
+    return HalvedImage(buffers.with_quantities(**split), drawn=True, notes=(note,))
 
 
 def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:

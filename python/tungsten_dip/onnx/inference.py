@@ -39,16 +39,13 @@ def infer(
     *,
     threads: int | None = None,
     refit_steps: int = 0,
-    candidates: Sequence[Halves] = (),
-    previous: Halves | None = None,
 ) -> FitResult:
     """Denoise one image with a fitted network, by onnxruntime alone.
 
-    ``buffers``, ``candidates`` and ``previous`` are as in `tungsten_dip.denoise`; the features, and how many
-    candidates, are those of the fit. ``threads`` None uses every core. With ``refit_steps``, a pointwise
-    network is first trained further on this image, as by a warm start, for so many steps at most; the
-    result's ``model`` is then the refined one. A network of the preset paper outputs the image itself, and
-    its error is not estimated.
+    ``buffers`` are as in `tungsten_dip.denoise`, with the features of the fit. ``threads`` None uses every
+    core. With ``refit_steps``, a pointwise network is first trained further on this image, as by a warm
+    start, for so many steps at most; the result's ``model`` is then the refined one. A network of the preset
+    paper outputs the image itself, and its error is not estimated.
 
     Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
     refit_steps cannot be done.
@@ -56,15 +53,11 @@ def infer(
     check_type("model", model, Model, "load_model reads one from a file")
     settings = inference_settings(model, threads, refit_steps)
     if model.layout is not None and refit_steps:
-        return denoise(
-            buffers, settings, progress, candidates=candidates, warm_start=model, previous=previous
-        )
-    known = prepared(buffers, candidates, previous, threads)
+        return denoise(buffers, settings, progress, warm_start=model)
+    known = prepared(buffers, threads)
     if model.layout is not None:
-        result = infer_fusion(model, known.buffers, settings, progress, known.candidates, known.previous)
+        result = infer_fusion(model, known.buffers, settings, progress)
     else:
-        if known.candidates or known.previous is not None:
-            raise InputError("a network of the preset paper takes no candidates")
         result = _infer_paper(model, known.buffers, settings, progress)
     return completed(result, known)
 
@@ -90,16 +83,18 @@ def infer_fusion(
     buffers: RenderBuffers,
     settings: FitSettings,
     progress: Progress,
-    candidates: Sequence[Halves] = (),
     previous: Halves | None = None,
 ) -> FitResult:
-    """Denoise sanitised buffers with a pointwise network, on the device of the settings; see `infer`."""
+    """Denoise sanitised buffers with a pointwise network, on the device of the settings; see `infer`.
+
+    ``previous`` is as in `tungsten_dip.fit.fusion.fit_fusion`.
+    """
     clock = Clock()
     assert model.layout is not None
     unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
         return unchanged
-    halved = with_independent_halves(buffers, candidates, settings.seed, settings.threads)
+    halved = with_independent_halves(buffers, settings.seed, settings.threads)
     layout = model.layout
     evidence = evidence_from_buffers(halved, settings, layout.pilots, clock, progress, previous, layout)
     all_samples_pilots: tuple[FloatImage, ...] = ()

@@ -115,7 +115,7 @@ class Follower:
         if camera is not None:
             check_camera(camera, buffers)
             self._tell_what_is_missing(buffers)
-        known = prepared(buffers, threads=self._settings.threads)
+        known = prepared(buffers, self._settings.threads)
         buffers = known.buffers
         smooth = self._with_smooth_albedo(buffers) if camera is not None else buffers
         how: How = "fitted"
