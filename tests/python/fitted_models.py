@@ -34,7 +34,7 @@ def session_of(model: Model) -> Any:
 
 def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
     """Return what a fit of preset draft knows of the buffers, with other pilots."""
-    return evidence_from_buffers(HalvedImage(buffers), DRAFT, pilots, Clock(), silent, None, None)
+    return evidence_from_buffers(HalvedImage(buffers), DRAFT, pilots, Clock(), silent, None)
 
 
 def check_result(result: FitResult, buffers: RenderBuffers) -> None:

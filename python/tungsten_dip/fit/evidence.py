@@ -113,19 +113,19 @@ class Evidence:
 def evidence_from_buffers(
     image: HalvedImage,
     settings: FitSettings,
-    pilots: Sequence[Pilot],
+    chosen: Layout | Sequence[Pilot],
     clock: Clock,
     progress: Progress,
     previous: Halves | None,
-    layout: Layout | None,
 ) -> Evidence:
     """Compute the pilots of an image, as many as the time budget lets begin (one at least).
 
-    ``previous`` is a candidate, NaN where it has no value, that guides the pilots as well. ``layout`` is that
-    of a fitted network, and ``pilots`` are its pilots: all of them are computed.
+    ``chosen`` are the pilots, or the layout of a fitted network, whose pilots are all computed. ``previous``
+    is a candidate, NaN where it has no value, that guides the pilots as well.
 
     Raises InputError if the layout has a feature that is missing or another number of candidates.
     """
+    layout, pilots = (chosen, chosen.pilots) if isinstance(chosen, Layout) else (None, chosen)
     buffers = image.buffers
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)

@@ -89,8 +89,8 @@ def fit_fusion(
     following = previous is not None
     preset = _preset(settings, following)
     layout = None if warm_start is None else warm_start.layout
-    pilots = layout.pilots if layout else _pilots(buffers, settings, preset, following)
-    evidence = evidence_from_buffers(halved, settings, pilots, clock, progress, previous, layout)
+    chosen = layout or _pilots(buffers, settings, preset, following)
+    evidence = evidence_from_buffers(halved, settings, chosen, clock, progress, previous)
     start = start_of_training(evidence, settings.seed, warm_start, preset.members)
     evidence = start.evidence
     network = PointwiseNetwork(

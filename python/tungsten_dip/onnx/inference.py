@@ -95,8 +95,7 @@ def infer_fusion(
     if unchanged is not None:
         return unchanged
     halved = with_independent_halves(buffers, settings.seed, settings.threads)
-    layout = model.layout
-    evidence = evidence_from_buffers(halved, settings, layout.pilots, clock, progress, previous, layout)
+    evidence = evidence_from_buffers(halved, settings, model.layout, clock, progress, previous)
     all_samples_pilots: tuple[FloatImage, ...] = ()
     if blends_all_samples(settings, following=previous is not None):
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
