@@ -38,7 +38,10 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
             self.steps += 1
             if self.steps % EVERY == 0:
                 evidence, examples = starts[-1].evidence, starts[-1].examples
-                of_halves = [self.fuse(examples.of_half(half)) for half in (0, 1)]
+                of_halves = [
+                    self.fuse(examples.of_half(half).inputs, [choice[half] for choice in evidence.choices])
+                    for half in (0, 1)
+                ]
                 image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])
                 found.append(compare(image.reshape(evidence.mean.shape), bench_set.reference).psnr)
 

@@ -11,6 +11,7 @@ import pytest
 
 from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
+from tungsten_dip.buffers.render_buffers import FloatArray
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, network_inputs
 from tungsten_dip.fit.layout import Layout, Pilot
@@ -59,7 +60,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
 
     expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(batch)])
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    squared = (in_onnx.fuse(batch) - batch.target) ** 2 * batch.weight
+    squared = (fused(in_onnx, batch) - batch.target) ** 2 * batch.weight
     assert loss == pytest.approx(squared.mean(), rel=1e-4)
 
     for _ in range(5):
@@ -67,6 +68,10 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
             network.step(batch, 1e-2)
     for name, value in in_torch.weights().items():
         np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-4, atol=1e-4)
+
+
+def fused(network: PointwiseNetwork, examples: Examples) -> FloatArray:
+    return network.fuse(examples.inputs, examples.choices.swapaxes(0, 1))
 
 
 def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
@@ -81,9 +86,9 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
     for first in range(0, 300, 100):
         for network in (together, *alone):
             network.step(examples.part(first, first + 100), 1e-2)
-    images = [network.fuse(examples) for network in alone]
+    images = [fused(network, examples) for network in alone]
     assert not np.array_equal(images[0], images[1])
-    np.testing.assert_array_equal(together.fuse(examples), sum(images) / np.float32(3))
+    np.testing.assert_array_equal(fused(together, examples), sum(images) / np.float32(3))
     for name, value in together.weights().items():
         np.testing.assert_array_equal(value, np.concatenate([network.weights()[name] for network in alone]))
 

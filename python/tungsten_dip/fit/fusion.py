@@ -8,15 +8,16 @@ preserved.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
-from tungsten_dip.fit.evidence import evidence_from_buffers, pilots_of_all_samples
+from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model, source_sha256
 from tungsten_dip.fit.pilots import (
@@ -101,7 +102,8 @@ def fit_fusion(
         evidence.threads,
     )
     training, all_samples_pilots = _trained(network, start, halved.buffers, settings, preset, clock, progress)
-    fused, all_samples_blend = _fused(network, start, all_samples_pilots)
+    inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
+    fused, all_samples_blend = fused_images(network, inputs, evidence, all_samples_pilots)
     result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
     if not training.interrupted:
         progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
@@ -197,15 +199,22 @@ def _wait_for(pending: Future[tuple[FloatImage, ...]]) -> None:
         pass
 
 
-def _fused(
-    network: PointwiseNetwork, start: Start, all_samples_pilots: tuple[FloatImage, ...]
+def fused_images(
+    network: PointwiseNetwork,
+    inputs: FloatArray,
+    evidence: Evidence,
+    all_samples_pilots: Sequence[FloatImage],
 ) -> tuple[Halves, FloatImage | None]:
-    """Return the network's blend of the pilots of both halves and, if given, of all samples."""
-    threads, shape = start.evidence.threads, start.evidence.mean.shape
-    halves = [start.examples.of_half(half) for half in (0, 1)]
-    fused = in_pair(lambda half: network.fuse(halves[half]).reshape(shape), threads)
+    """Return the network's blend of the pilots of both halves and, if given, of all samples.
+
+    ``inputs`` are standardised, shape (2, height * width, inputs).
+    """
+    shape = evidence.mean.shape
+
+    def blend(half: int, pilots: Sequence[FloatImage]) -> FloatImage:
+        return network.fuse(inputs[half], pilots).reshape(shape)
+
+    fused = in_pair(lambda h: blend(h, [choice[h] for choice in evidence.choices]), evidence.threads)
     if not all_samples_pilots:
         return fused, None
-    return fused, mean_of(
-        in_pair(lambda half: network.fuse(halves[half], all_samples_pilots).reshape(shape), threads)
-    )
+    return fused, mean_of(in_pair(lambda h: blend(h, all_samples_pilots), evidence.threads))

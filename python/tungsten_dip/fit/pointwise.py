@@ -12,7 +12,7 @@ once. The number of pixels is free.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,18 +153,21 @@ class PointwiseNetwork:
 
         self._members = in_parallel(stepped, self._members, self._threads)
 
-    def fuse(self, examples: Examples, images: Sequence[FloatImage] = ()) -> FloatArray:
-        """Return the weighted mean of the choices or, by the same weights, of ``images``; shape (pixels, 3).
+    def fuse(self, inputs: FloatArray, choices: Iterable[FloatImage]) -> FloatArray:
+        """Return the mean of the choices, with the weights for ``inputs``; both as in `Examples`.
+
+        ``choices`` come one after the other, each of shape (pixels, 3) or (height, width, 3); the result has
+        shape (pixels, 3).
 
         Raises InputError if it is not finite.
         """
-        flat = [image.reshape(-1, 3) for image in images]
-        fused = np.empty((len(examples.inputs), 3), np.float32)
+        flat = [image.reshape(-1, 3) for image in choices]
+        fused = np.empty((len(inputs), 3), np.float32)
         for first in range(0, len(fused), _RUN_PIXELS):
             part = slice(first, first + _RUN_PIXELS)
             feeds = {
-                "inputs": examples.inputs[part],
-                "choices": np.stack([image[part] for image in flat], 1) if flat else examples.choices[part],
+                "inputs": inputs[part],
+                "choices": np.stack([image[part] for image in flat], axis=1),
             }
             by_members = (
                 self._fuse.run(["fused"], {**feeds, "weights": member["weights"]})[0]

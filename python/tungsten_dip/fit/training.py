@@ -142,7 +142,11 @@ class _Probe:
 
     def errors(self, network: PointwiseNetwork) -> tuple[float, float]:
         """Return the estimated error, and the error on the other half."""
-        fused = in_pair(lambda half: network.fuse(self.examples[half]), self.threads)
+
+        def of_half(half: int) -> FloatArray:
+            return network.fuse(self.examples[half].inputs, [choice[half] for choice in self.choices])
+
+        fused = in_pair(of_half, self.threads)
         errors = estimate_error(self.choices, self.scale, fused)
         return float(errors.mean(dtype=np.float64)), held_out_error(self.choices, fused)
 

@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.display import radiance_from_ldr
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
-from tungsten_dip.cores import in_pair, thread_count
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import check_ready, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.fusion import blends_all_samples
-from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half
+from tungsten_dip.fit.fusion import blends_all_samples, fused_images
+from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
+from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
@@ -28,8 +29,6 @@ from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
 
 _BAND_PIXELS = 1 << 18
-_RUN_PIXELS = 1 << 13
-"""Pixels that the network processes at once: the outputs of its layers stay in the processor's cache."""
 
 
 def infer(
@@ -108,38 +107,26 @@ def infer_fusion(
 def _fused(
     model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage], device: Device
 ) -> tuple[Halves, FloatImage | None]:
-    """Return the blended pilots of both halves and, if given, of all samples, computed band by band."""
-    # Both halves are computed side by side; the network is too small to share.
-    session = session_from_proto(graph_of(model), 1, device)
+    """Return what `fused_images` does, computed band by band: the inputs of a large image need gigabytes."""
+    assert model.standardisation is not None
+    layout, threads = evidence.layout, evidence.threads
+    network = PointwiseNetwork(model.weights, len(layout.inputs), layout.choice_count, device, threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
-    rows_at_once = max(1, _RUN_PIXELS // width)
-
-    def of_half(half: int) -> tuple[FloatImage, ...]:
-        to_blend = [[choice[half] for choice in evidence.choices]]
-        if all_samples_pilots:
-            to_blend.append(list(all_samples_pilots))
-        fused = tuple(np.empty_like(evidence.mean) for _ in to_blend)
-        inputs = np.empty((len(model.inputs), min(rows, height), width), np.float32)
-        for first in range(0, height, rows):
-            end = min(first + rows, height)
-            # The inputs of a row come from the rows around it.
-            above, below = max(first - INPUTS_RADIUS, 0), min(end + INPUTS_RADIUS, height)
-            for index, image in enumerate(inputs_of_half(evidence.rows(above, below), half)):
-                inputs[index, : end - first] = image[first - above : end - above]
-            for row in range(first, end, rows_at_once):
-                part = slice(row, min(row + rows_at_once, end))
-                some = np.ascontiguousarray(inputs[None, :, part.start - first : part.stop - first])
-                for image, images in zip(fused, to_blend, strict=True):
-                    choices = np.stack([choice[part].transpose(2, 0, 1) for choice in images])[None]
-                    color = session.run(["color"], {"inputs": some, "choices": choices})[0]
-                    check_finite(color)
-                    image[part] = color[0].transpose(1, 2, 0)
-        return fused
-
-    (half_a, *by_a), (half_b, *by_b) = in_pair(of_half, evidence.threads)
-    all_samples_blend = mean_of((by_a[0], by_b[0])) if all_samples_pilots else None
-    return (half_a, half_b), all_samples_blend
+    bands = []
+    for first in range(0, height, rows):
+        end = min(first + rows, height)
+        # The inputs of a row come from the rows around it.
+        above, below = max(first - INPUTS_RADIUS, 0), min(end + INPUTS_RADIUS, height)
+        inputs = network_inputs(evidence.rows(above, below))[
+            :, (first - above) * width : (end - above) * width
+        ]
+        model.standardisation.apply(inputs, threads)
+        pilots = [pilot[first:end] for pilot in all_samples_pilots]
+        bands.append(fused_images(network, inputs, evidence.rows(first, end), pilots))
+    halves, blends = zip(*bands, strict=True)
+    a, b = (np.concatenate(images) for images in zip(*halves, strict=True))
+    return (a, b), np.concatenate(blends) if all_samples_pilots else None
 
 
 def _infer_paper(
