@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NoReturn, get_args
 
 import tungsten_dip
 from tungsten_dip.buffers.atomic import check_writable, write_text
@@ -30,10 +31,9 @@ from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_re
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
-from tungsten_dip.hosts import Host, chosen_host
+from tungsten_dip.hosts import Host, chosen_host, native
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
-from tungsten_dip.hosts.native import run_native
 from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
@@ -116,9 +116,9 @@ def _run(arguments: Sequence[str] | None) -> None:
             "--checkpoint 0: without checkpoints there is no --dip-preview; name a time between them, as 5m"
         )
     if host == "tungsten" and not options.dip_denoise:
-        run_native(_stock_arguments(arguments))
+        _run_native(_stock_arguments(arguments))
     if host == "tungsten" and not tungsten_host.in_process():
-        run_native(arguments)
+        _run_native(arguments)
 
     warm_start = load_warm_start(options)
     settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
@@ -145,6 +145,17 @@ def _run(arguments: Sequence[str] | None) -> None:
             _LOG.error("%s", error)
     if failed:
         raise InputError(f"{failed} of {len(options.scenes)} scenes failed, see above")
+
+
+def _run_native(arguments: Sequence[str]) -> NoReturn:
+    """Replace this process by the native command; without ``--dip-`` flags that is stock Tungsten.
+
+    Raises InputError if the package was built without a Tungsten.
+    """
+    command = native.required_executable()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(command, ["tungsten", *arguments], native.environment())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -34,15 +34,17 @@ def executable() -> Path | None:
     return path if os.access(path, os.X_OK) else None
 
 
-def run_native(arguments: Sequence[str]) -> NoReturn:
-    """Replace this process by the native command; without ``--dip-`` flags that is stock Tungsten.
+def required_executable() -> Path:
+    """Return the native command. Raises InputError if the package was built without a Tungsten."""
+    command = executable()
+    if command is None:
+        raise InputError(f"Tungsten is not there; {BUILD_HINT}")
+    return command
 
-    Raises InputError if the package was built without a Tungsten.
-    """
-    command = _require_executable()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execve(command, ["tungsten", *arguments], _environment())
+
+def environment() -> dict[str, str]:
+    """Return the environment that the native command needs: its Python is this one."""
+    return {**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable}
 
 
 def render_in_child(scene: Path, options: dict[str, Any], progress: Progress) -> RenderBuffers:
@@ -50,7 +52,7 @@ def render_in_child(scene: Path, options: dict[str, Any], progress: Progress) ->
 
     Raises InputError if there is no such command, or the render fails.
     """
-    command = _require_executable()
+    command = required_executable()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         read_end, write_end = os.pipe()
         lines = stack.enter_context(os.fdopen(read_end))
@@ -63,7 +65,7 @@ def render_in_child(scene: Path, options: dict[str, Any], progress: Progress) ->
                 str(scene),
                 json.dumps(options, default=str),
             ]
-            child = stack.enter_context(subprocess.Popen(program, env=_environment(), pass_fds=[write_end]))
+            child = stack.enter_context(subprocess.Popen(program, env=environment(), pass_fds=[write_end]))
         try:
             for line in lines:
                 fraction, _, message = line.rstrip("\n").partition(" ")
@@ -119,15 +121,3 @@ def render_to_folder(arguments: Sequence[str]) -> int:
 
 def _planes(files: Sequence[str], name: str) -> list[str]:
     return [file.removeprefix(f"{name}.") for file in files if file.startswith(f"{name}.")]
-
-
-def _require_executable() -> Path:
-    command = executable()
-    if command is None:
-        raise InputError(f"Tungsten is not there; {BUILD_HINT}")
-    return command
-
-
-def _environment() -> dict[str, str]:
-    """The native command's Python is this one."""
-    return {**os.environ, "TUNGSTEN_DIP_PYTHON": sys.executable}
