@@ -9,6 +9,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdlib>
 #include <iterator>
 #include <stdexcept>
 #include <vector>
@@ -87,9 +88,10 @@ TUNGSTEN_DIP_FASTEST void average_patches(float* distances, int columns, int cou
     for (int x = 0; x < count; ++x) means[x] = std::max(scale * means[x], 0.0F);
 }
 
-// weights = exp(-distance), to which the features from (y, x) on add their distance from those at an offset.
+// weights = share * exp(-distance), to which the features from (y, x) on add their distance from those at an
+// offset.
 TUNGSTEN_DIP_FASTEST void weigh_row(const PaddedPlanes& features, int y, int x, int dy, int dx,
-                                    const FeatureValues& penalty, int count, float* weights) {
+                                    const FeatureValues& penalty, float share, int count, float* weights) {
     for (int f = 0; f < features.channels(); ++f) {
         const float scale = penalty[static_cast<std::size_t>(f)];
         if (scale <= 0) continue;
@@ -97,7 +99,7 @@ TUNGSTEN_DIP_FASTEST void weigh_row(const PaddedPlanes& features, int y, int x, 
         const float* q = features.row(f, y + dy) + x + dx;
         for (int i = 0; i < count; ++i) weights[i] += scale * (p[i] - q[i]) * (p[i] - q[i]);
     }
-    for (int i = 0; i < count; ++i) weights[i] = exp_minus(std::max(weights[i], 0.0F));
+    for (int i = 0; i < count; ++i) weights[i] = share * exp_minus(std::max(weights[i], 0.0F));
 }
 
 // What a row of neighbours adds to the normal equations: planes of 1, f, f f' (upper triangle), and per
@@ -347,7 +349,8 @@ class Regression {
             const int end = std::min(tile.y + tile.height, target_.height() - dy);
             if (first >= end) continue;
             for (int k = 0; k < offset_count; ++k) {
-                weigh(tile, dy, k * step - reach, scratch,
+                const int dx = k * step - reach;
+                weigh(tile, dy, dx, share(dy, reach, step) * share(dx, reach, step), scratch,
                       scratch.weights.data() + std::ptrdiff_t{k} * tile_width, weights_of_row);
             }
             for (int y = first; y < end; ++y) {
@@ -358,15 +361,22 @@ class Regression {
         }
     }
 
+    // The ends of a window that skips pixels count half (trapezoidal rule). If they counted in full, the two
+    // sums together would give every second or third pixel more weight than its neighbours: a grid would
+    // show.
+    [[nodiscard]] static float share(int offset, int reach, int step) {
+        return step > 1 && std::abs(offset) == reach ? 0.5F : 1.0F;
+    }
+
     // The weights of the tile's neighbours at one offset; 0 outside of the image, but for whole rows of them.
-    void weigh(const Tile& tile, int dy, int dx, Scratch& scratch, float* weights,
+    void weigh(const Tile& tile, int dy, int dx, float share, Scratch& scratch, float* weights,
                std::ptrdiff_t weights_of_row) const {
         if (guided_) compare_guide(tile, dy, dx, scratch, weights, weights_of_row);
         for (int i = 0; i < tile.height; ++i, weights += weights_of_row) {
             const int y = tile.y + i;
             if (y + dy < 0 || y + dy >= target_.height()) continue;
             if (!guided_) std::fill_n(weights, tile_width, 0.0F);
-            weigh_row(features_, y, tile.x, dy, dx, penalty_, rounded_up(tile.width, lanes), weights);
+            weigh_row(features_, y, tile.x, dy, dx, penalty_, share, rounded_up(tile.width, lanes), weights);
             const int first = std::clamp(-dx - tile.x, 0, tile.width);
             const int last = std::clamp(target_.width() - dx - tile.x, 0, tile.width);
             std::fill(weights, weights + first, 0.0F);

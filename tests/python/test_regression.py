@@ -55,7 +55,8 @@ def _plain_regress(
                     distance = max(_patch_distance(guide, guide_variance, at, k), 0.0)
                 apart = f[row, column] - f[row + dy, column + dx]
                 distance += float(np.dot(penalty, apart**2))
-                found.append((row + dy, column + dx, np.exp(-distance)))
+                ends = (abs(dy) == reach) + (abs(dx) == reach) if step > 1 else 0
+                found.append((row + dy, column + dx, 0.5**ends * np.exp(-distance)))
         return found
 
     fits = {}
@@ -127,6 +128,18 @@ def test_agrees_with_a_plain_regression(
     assert out.dtype == np.float32
     assert out.shape == (*size, 3)
     np.testing.assert_allclose(out, _plain_regress(*arguments, **window), atol=2e-4)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("radius", "step"), [(6, 2), (12, 2), (18, 2), (24, 3)])
+def test_windows_that_skip_pixels_leave_no_grid(radius: int, step: int) -> None:
+    nothing = np.empty((120, 130, 0), np.float32)
+    for period in (step, step + 1):
+        grid = np.zeros((120, 130, 3), np.float32)
+        grid[::period, ::period] = period**2
+        out = _core.regress(grid, nothing, (), radius=radius, step=step, threads=2)
+        inside = out[2 * radius : -2 * radius, 2 * radius : -2 * radius]
+        assert inside.size > 1000
+        np.testing.assert_allclose(inside, 1, rtol=1e-5)
 
 
 def test_repeated_and_constant_features_do_no_harm() -> None:
