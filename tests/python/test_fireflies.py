@@ -73,6 +73,40 @@ def test_a_light_that_both_halves_show_is_left_alone(radiance: float) -> None:
         np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.parametrize("case", ["few samples", "many samples", "emission", "no variance"])
+def test_both_halves_confirm_a_light_that_more_than_a_few_samples_or_the_albedo_show(case: str) -> None:
+    halves = _halves()
+    for half in halves:
+        half[5, 6] = 1e3
+    # Two of sixteen samples found it, or it varies by a tenth.
+    deviation = 0.5**0.5 if case in ("few samples", "emission") else 0.1
+    variance = None if case == "no variance" else (deviation * halves[0]).astype(np.float32) ** 2
+    lamp = np.zeros_like(halves[0])
+    lamp[5, 6] = 900
+    emission = (lamp, lamp) if case == "emission" else None
+    limited = limit_fireflies(*halves, 1, emission, variance)
+    if case == "few samples":
+        assert limited.note is not None
+        assert limited.note.startswith("2 fireflies limited")
+        assert all(half[5, 6].mean() < 30 for half in limited.halves)
+    else:
+        assert limited.note is None
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_light_that_few_samples_find_in_both_halves_is_kept(both: bool) -> None:
+    rng = np.random.default_rng(5)
+    halves = _halves(60, 90)
+    for half in halves if both else halves[:1]:
+        half[rng.random((60, 90)) < 0.05] = 1e3
+    limited = limit_fireflies(*halves, 2)
+    kept = sum(half.sum() for half in limited.halves) / sum(half.sum() for half in halves)
+    if both:
+        assert kept > 0.99
+    else:
+        assert kept < 0.9
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 5), (24, 31)])
 def test_images_without_fireflies_keep_every_bit(size: tuple[int, int]) -> None:
     for halves in (_halves(*size), (np.zeros((*size, 3), np.float32),) * 2):

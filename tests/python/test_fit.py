@@ -552,6 +552,45 @@ def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
     assert np.abs(image[far].mean() / color.mean[far].mean() - 1) < 0.05
 
 
+def _lamps_of_few_pixels(seed: int) -> tuple[RenderBuffers, FloatImage]:
+    """Four spp of 25 lamps of 1.5 x 1.5 pixels, 4000 times brighter than the wall; the truth."""
+    rng = np.random.default_rng(seed)
+    height, width, radiance, side = 72, 96, 40.0, 1.5
+    coverage = np.zeros((height, width, 1))
+    for cell in np.ndindex(5, 5):
+        top, left = (np.array(cell) + rng.uniform(0.2, 0.8, 2)) * (height / 5, width / 5)
+        rows, columns = (
+            np.clip(np.minimum(np.arange(size) + 1, start + side) - np.maximum(np.arange(size), start), 0, 1)
+            for size, start in ((height, top), (width, left))
+        )
+        coverage[:, :, 0] = np.maximum(coverage[:, :, 0], np.outer(rows, columns))
+    hits = [rng.binomial(2, coverage) / 2 for _ in range(2)]
+
+    def halved(of_wall: list[FloatImage] | list[float], of_lamps: float) -> Buffer:
+        a, b = (
+            ((1 - hit) * wall + of_lamps * hit).astype(np.float32).repeat(3, axis=2)
+            for hit, wall in zip(hits, of_wall, strict=True)
+        )
+        return Buffer((a + b) / 2, a, b)
+
+    wall = [rng.gamma(2, 0.005, coverage.shape).astype(np.float32) for _ in range(2)]
+    towards = np.zeros((height, width, 3), np.float32)
+    towards[:, :, 2] = 1
+    buffers = RenderBuffers(
+        halved(wall, radiance), albedo=halved([0.2, 0.2], radiance), normal=Buffer(towards)
+    )
+    truth = 0.01 * (1 - coverage) + radiance * coverage
+    return buffers, truth.astype(np.float32).repeat(3, axis=2)
+
+
+@pytest.mark.parametrize("preset", ["draft", "balanced"])
+def test_lamps_of_few_pixels_do_not_light_the_wall_beside_them(preset: str) -> None:
+    for seed in range(3):
+        buffers, truth = _lamps_of_few_pixels(seed)
+        result = denoise(buffers, FitSettings(preset=preset))
+        assert relmse(result.color, truth) < relmse(buffers.color.mean, truth)
+
+
 def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> None:
     """A path that happens upon a lamp through glass must not leave a bright pixel."""
 

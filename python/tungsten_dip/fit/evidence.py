@@ -13,7 +13,6 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.buffers.render_buffers import (
     FEATURES,
-    Buffer,
     FloatImage,
     Halves,
     Indices,
@@ -38,7 +37,7 @@ from tungsten_dip.fit.pilots import (
 )
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
-from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, surfaces_of_halves
+from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
 from tungsten_dip.progress import Progress
 
 _NOISE_RADIUS = 8
@@ -47,6 +46,9 @@ _NEAR_RADIUS = 2
 
 OUTLIER = 20.0
 """Squared errors are capped at so many times the local mean where local noise is estimated from them."""
+
+_BAND_ROWS = 64
+"""Rows of all pilots that are sorted at a time: large images need gigabytes for each copy."""
 
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
@@ -60,7 +62,8 @@ class Evidence:
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
     (height, width). ``choices`` holds both halves of the noisy image, of every pilot, of every candidate.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and the
-    other half, in the pixels around each. ``guide_noise`` is that of the pilots' guides (see
+    other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a half
+    are relative to. ``guide_noise`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`).
     ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
@@ -71,6 +74,7 @@ class Evidence:
     layout: Layout
     choices: tuple[Halves, ...]
     noises: Halves
+    denominators: Halves
     guide_noise: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
@@ -81,11 +85,6 @@ class Evidence:
     def halves(self) -> Halves:
         """The noisy halves."""
         return self.choices[0]
-
-    @property
-    def denominators(self) -> Halves:
-        """What squared errors are relative to, per half, shape (height, width, 1)."""
-        return _denominators(self.choices[self.layout.denominator])
 
     def choices_at(self, pixels: Indices) -> tuple[Halves, ...]:
         """Return the choices at some pixels, shape (pixels, 3)."""
@@ -105,6 +104,7 @@ class Evidence:
             ),
             choices=tuple(cut(choice) for choice in self.choices),
             noises=cut(self.noises),
+            denominators=cut(self.denominators),
             guide_noise=self.guide_noise[first:end],
             gain=None if self.gain is None else self.gain[first:end],
         )
@@ -129,7 +129,7 @@ def evidence_from_buffers(
     buffers = image.buffers
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
-    mean, limited = _without_fireflies(buffers.color, scale, threads)
+    mean, limited = _without_fireflies(buffers, scale, threads)
     halves = limited.halves
     surfaces = surfaces_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
@@ -150,7 +150,7 @@ def evidence_from_buffers(
         candidates.append(filled)
 
     choices = (halves, *computed, *candidates)
-    denominators = _denominators(computed[-1])
+    denominators = _denominators(computed)
     if layout is None:
         baseline = _best(choices, denominators)
         layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), baseline)
@@ -164,6 +164,7 @@ def evidence_from_buffers(
         layout=layout,
         choices=choices,
         noises=noises,
+        denominators=denominators,
         guide_noise=guides.noise,
         gain=limited.gain,
         halves_drawn=image.drawn,
@@ -205,11 +206,15 @@ def _computed(
     return computed
 
 
-def _without_fireflies(color: Buffer, scale: float, threads: int) -> tuple[FloatImage, Limited]:
+def _without_fireflies(buffers: RenderBuffers, scale: float, threads: int) -> tuple[FloatImage, Limited]:
     """Return the mean and the halves, scaled, without fireflies."""
+    color = buffers.color
     assert color.halves is not None
-    half_a, half_b = color.halves
-    limited = limit_fireflies(scaled(half_a, scale), scaled(half_b, scale), threads)
+    half_a, half_b = (scaled(half, scale) for half in color.halves)
+    variance = None if color.variance is None else scaled(color.variance, scale**2)
+    limited = limit_fireflies(
+        half_a, half_b, threads, emission_of_halves(buffers, (half_a, half_b), scale, threads), variance
+    )
     if limited.gain is None:
         return scaled(color.mean, scale), limited
     return mean_of(limited.halves), limited
@@ -329,8 +334,18 @@ def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:
     return (f"no {', '.join(missing)}: edges are found with less evidence{instead}",)
 
 
-def _denominators(pilot: Halves) -> Halves:
-    a, b = (channel_mean(image) ** 2 + np.float32(RELMSE_EPSILON) for image in pilot)
+def _denominators(pilots: Sequence[Halves]) -> Halves:
+    """Return the squared level of each half's last pilot or, where that is less, the median one, plus 0.01.
+
+    Relative to itself, a pilot that spreads a lamp over dark pixels beside it would have little error there.
+    """
+    a, b = (np.empty((*half.shape[:2], 1), np.float32) for half in pilots[-1])
+    for half, denominator in enumerate((a, b)):
+        for first in range(0, len(denominator), _BAND_ROWS):
+            band = slice(first, first + _BAND_ROWS)
+            levels = [channel_mean(pilot[half][band]) for pilot in pilots]
+            denominator[band] = np.minimum(levels[-1], np.median(levels, axis=0)) ** 2
+        denominator += np.float32(RELMSE_EPSILON)
     return a, b
 
 

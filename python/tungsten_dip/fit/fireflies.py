@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
-from tungsten_dip.fit.neighbours import mean_around
+from tungsten_dip.fit.neighbours import mean_around, window_pixels
 
 _RADIUS = 8
 _LIMIT = 15.0
@@ -22,6 +23,16 @@ _LIMIT = 15.0
 
 _LIMIT_OF_OTHER = 4.0
 """How many times brighter than in the other half: real detail is about equal in both halves."""
+
+_FEW_SAMPLES = 0.35
+"""Relative variance of a mean that some three samples carry: the same firefly may have struck both halves."""
+
+_CROWD = 4
+"""So many pixels of the other half, all as bright as a pixel that they surround, are no chance: few samples
+find this light."""
+
+_CROWD_PIXELS = 1 << 12
+"""Pixels whose surroundings are sorted at a time."""
 
 _ROUNDS = 100
 """Enough for a cluster of 3x3 pixels, which every round lowers to 0.4 of itself, from 1e30 to 1e-10."""
@@ -58,16 +69,33 @@ class Limited:
     note: str | None = None
 
 
-def limit_fireflies(half_a: FloatImage, half_b: FloatImage, threads: int) -> Limited:
+def limit_fireflies(
+    half_a: FloatImage,
+    half_b: FloatImage,
+    threads: int,
+    emission: Halves | None = None,
+    variance: FloatImage | None = None,
+) -> Limited:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    What is about equal in both halves is left alone, whatever its radiance, and so is everything up to 15
-    times the mean of the 17x17 pixels around it. Where that would be most of the pixels that have any light,
-    they are the image (stars, or a caustic on black), and fireflies are 15 times brighter than their median.
+    Left alone, whatever its radiance, is what is about equal in both halves, unless the ``variance`` of their
+    mean shows that few samples carry it, and no ``emission`` explains it. So is what is no brighter than four
+    of the 17x17 pixels around it are in the other half, without their emission, and everything up to 15 times
+    the mean of both halves there. Where this leaves out most of the pixels that have any light, they are the
+    image (stars, or a caustic on black), and fireflies are 15 times brighter than their median. All images
+    are linear radiance of shape (height, width, 3).
     """
     levels = [_level(half) for half in (half_a, half_b)]
-    around = _surroundings((levels[0] + levels[1]) / 2, threads)
-    limits = [np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other) for other in levels[::-1]]
+    mean = (levels[0] + levels[1]) / 2
+    around = _surroundings(mean, threads)
+    lights = [_level(light) for light in emission] if emission else [np.zeros_like(mean)] * 2
+    confirmed = np.ones(mean.shape, bool)
+    if variance is not None:
+        confirmed = (_level(variance) <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
+    limits = []
+    for level, other, light_of_other in zip(levels, levels[::-1], lights[::-1], strict=True):
+        limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other * confirmed)
+        limits.append(np.maximum(limit, _crowd(level > limit, np.maximum(other - light_of_other, 0))))
     count = sum(int(np.count_nonzero(level > limit)) for level, limit in zip(levels, limits, strict=True))
     lit = sum(int(np.count_nonzero(level)) for level in levels)
     if 2 * count > lit:
@@ -93,6 +121,18 @@ def _level(image: FloatImage) -> _Levels:
     return level
 
 
+def _crowd(struck: npt.NDArray[np.bool_], other: _Levels) -> _Levels:
+    """Return how bright the `_CROWD` brightest pixels of the other half are around those struck, else 0."""
+    crowd = np.zeros_like(other)
+    rows, columns = np.nonzero(struck[:, :, 0])
+    size = 2 * _RADIUS + 1
+    windows = sliding_window_view(np.pad(other[:, :, 0], _RADIUS), (size, size))
+    for first in range(0, len(rows), _CROWD_PIXELS):
+        at = rows[first : first + _CROWD_PIXELS], columns[first : first + _CROWD_PIXELS]
+        crowd[at] = np.partition(windows[at].reshape(-1, size**2), -_CROWD)[:, -_CROWD, None]
+    return crowd
+
+
 def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> FloatImage:
     """Return the image, no brighter than the limit."""
     over = level > limit
@@ -108,9 +148,8 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     the halves differ: pixels without noise keep their radiance. Fireflies strike independently of one
     another, so that the variance of their sum is the sum of their squares.
     """
-    height, width = taken[0].shape[:2]
-    radius = max(height, width) // 4
-    pixels = np.outer(_extents(height, radius), _extents(width, radius))[:, :, None]
+    radius = max(taken[0].shape[:2]) // 4
+    pixels = window_pixels(taken[0].shape, radius)
     mean = _core.box_mean(mean_of((taken[0], taken[1])), radius, threads)
     squares = _core.box_mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
     certain = np.maximum(mean - np.float32(_SURELY) * np.sqrt(squares / pixels), 0)
@@ -121,12 +160,6 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     gain = 1 + certain * share / np.maximum(level, np.float32(_LEAST))
     bounded: FloatImage = np.minimum(gain, _LARGEST_GAIN).astype(np.float32)
     return bounded
-
-
-def _extents(size: int, radius: int) -> npt.NDArray[np.int64]:
-    """Return how many pixels of a row of ``size`` pixels the window around each of them covers."""
-    at = np.arange(size)
-    return np.minimum(at + radius + 1, size) - np.maximum(at - radius, 0)
 
 
 def _surroundings(level: _Levels, threads: int) -> FloatImage:

@@ -47,11 +47,6 @@ class Layout:
         return 1 + len(self.pilots) + self.candidate_count
 
     @property
-    def denominator(self) -> int:
-        """The index of the pilot that all errors are relative to: the last that filters compute."""
-        return len(self.pilots)
-
-    @property
     def inputs(self) -> tuple[str, ...]:
         """The names of what `inputs_of_half` yields, in its order."""
         return (

@@ -1,4 +1,4 @@
-"""The mean of the pixels around a pixel, without the pixel itself."""
+"""The pixels around a pixel: how many there are, and their mean without the pixel itself."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import FloatImage
 
 
-def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
-    """Return the mean of the (2 radius + 1)^2 pixels around each, without it (0 where there is no other)."""
+def window_pixels(shape: tuple[int, ...], radius: int) -> FloatImage:
+    """Return how many pixels of an image the window around each of them covers, shape (height, width, 1)."""
     rows, columns = (
-        np.minimum(np.arange(n) + radius, n - 1) - np.maximum(np.arange(n) - radius, 0) + 1
-        for n in image.shape[:2]
+        np.minimum(np.arange(n) + radius, n - 1) - np.maximum(np.arange(n) - radius, 0) + 1 for n in shape[:2]
     )
     count: FloatImage = np.outer(rows, columns).astype(np.float32)[..., None]
+    return count
+
+
+def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
+    """Return the mean of the (2 radius + 1)^2 pixels around each, without it (0 where there is no other)."""
+    count = window_pixels(image.shape, radius)
     others: FloatImage = _core.box_mean(image, radius, threads) * count - image
     others /= np.maximum(count - 1, 1)
     return others

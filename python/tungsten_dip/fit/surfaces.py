@@ -10,7 +10,7 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.prefilter import prefilter_features
-from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, Halves, RenderBuffers, mean_of
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
@@ -37,6 +37,9 @@ _ACROSS_EDGES = 0.3
 """Standard deviation, in pixels, of the mean along edges in the direction across them."""
 
 _CHANNELS = {"albedo": "RGB", "alpha": "A", "normal": "XYZ", "depth": "Z"}
+
+_LIT_AROUND = 2.5 / 9
+"""Beside the straight edge of a lamp, a third of the 3x3 pixels is lit; beside a lamp of few pixels, less."""
 
 _STRAY = 4.0
 _STRAY_RADIUS = 2
@@ -129,6 +132,19 @@ def surfaces_of_halves(
     )
 
 
+def emission_of_halves(buffers: RenderBuffers, colors: Halves, scale: float, threads: int) -> Halves | None:
+    """Return the radiance emitted towards the samples of each half, if there is any.
+
+    ``colors`` and the results are linear radiance times ``scale``, shape (height, width, 3), of sanitised
+    buffers.
+    """
+    if buffers.albedo is None or not (buffers.albedo.mean > 1).any():
+        return None
+    albedos = _bounded_albedos(_without_stray_emission(buffers.albedo, threads), colors, scale)
+    a, b = (np.maximum(albedo - 1, 0) * np.float32(scale) for albedo in albedos)
+    return a, b
+
+
 def alpha_as_albedo(buffers: RenderBuffers) -> FloatImage | None:
     """Return the alpha, 0 to 1, that takes the place of a missing albedo, shape (height, width, 1).
 
@@ -203,9 +219,12 @@ def _surfaces(
 def _smooth_emission(
     emission: FloatImage, filtered: FloatImage, edges: FloatImage, threads: int
 ) -> FloatImage:
-    # The pre-filter blurs long edges of bright lights, the mean along edges their corners.
+    # The pre-filter blurs long edges of bright lights, the mean along edges their corners, and both smear
+    # lamps of few pixels.
+    lit = (channel_mean(emission) > 0).astype(np.float32)
+    beside = _core.box_mean(lit, 1, threads) > _LIT_AROUND
     smooth: FloatImage = np.float32(0.5) * (filtered + along_edges(emission, edges, EDGES_RADIUS, threads))
-    return smooth
+    return smooth * np.maximum(lit, beside)
 
 
 def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
