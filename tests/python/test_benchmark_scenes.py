@@ -26,7 +26,7 @@ def test_every_frame_of_every_scene_can_be_read(tmp_path):
     assert {file.name for file in files} == {
         f"{what}-000{frame}.json" for what in ("noisy", "reference") for frame in (0, 1)
     }
-    assert len({load_scene(file).path.parent for file in files}) == len(files) // 4 == 7
+    assert len({load_scene(file).path.parent for file in files}) == len(files) // 4 == 12
 
 
 @pytest.mark.parametrize("frames", ["0", "-1"])

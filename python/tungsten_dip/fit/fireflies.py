@@ -108,7 +108,10 @@ def limit_fireflies(
     taken = [np.maximum(level - limit, 0) for level, limit in zip(levels, limits, strict=True)]
     share = float(taken[0].sum() + taken[1].sum()) / float(levels[0].sum() + levels[1].sum())
     noun = "firefly" if count == 1 else "fireflies"
-    note = f"{count} {noun} limited, with {100 * share:.3g}% of the image's energy"
+    note = (
+        f"{count} {noun} limited, with {100 * share:.3g}% of the image's energy, which the estimated error "
+        "leaves out"
+    )
     returned = [np.minimum(t, _MOST_RETURNED * around).astype(np.float32) for t in taken]
     return Limited((a, b), _gain(returned, (a, b), threads), note)
 
