@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdlib>
 #include <limits>
 #include <map>
 #include <stdexcept>
@@ -81,14 +82,19 @@ void constants_stay() {
     }
 }
 
-// Of a mean over every `step`th pixel of a mean over every `next`th one, along one axis.
+// Of a mean over every `step`th pixel of a mean over every `next`th one, along one axis. The ends of a window
+// that skips pixels count half.
 double variance_of_two_means(int radius, int step, int next) {
     std::map<int, double> weights;
     double sum = 0;
+    const auto share = [radius](int i, int step) {
+        return step > 1 && std::abs(i) == radius / step ? 0.5 : 1.0;
+    };
     for (int i = -(radius / step); i <= radius / step; ++i) {
         for (int j = -(radius / next); j <= radius / next; ++j) {
-            weights[i * step + j * next] += 1;
-            sum += 1;
+            const double weight = share(i, step) * share(j, next);
+            weights[i * step + j * next] += weight;
+            sum += weight;
         }
     }
     double squares = 0;

@@ -10,7 +10,7 @@ import pytest
 from conftest import MakeRender
 from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, _noises
+from tungsten_dip.fit.evidence import Evidence, _denominators, _noises
 from tungsten_dip.fit.exposure import unscaled
 from tungsten_dip.fit.inputs import loss_weights
 from tungsten_dip.fit.pilots import PilotMaker
@@ -54,6 +54,15 @@ def test_pixels_count_less_where_the_noise_is_heavy(monkeypatch: pytest.MonkeyPa
     for weight in (of_a, of_b):
         calm, heavy = np.median(weight[:, 4:30]), np.median(weight[:, 50:-4])
         assert 0.03 < heavy / calm < 0.3
+
+
+def test_errors_are_relative_to_the_darker_of_the_last_pilot_and_the_median_one() -> None:
+    levels = [(1, 9), (2, 2), (3, 1), (8, 3), (5, 0.5)]
+    pilots = [tuple(np.full((130, 2, 3), level, np.float32) for level in pair) for pair in levels]
+    of_a, of_b = _denominators([(a, b) for a, b in pilots])
+    assert of_a.shape == of_b.shape == (130, 2, 1)
+    np.testing.assert_allclose(of_a, 3**2 + 0.01)
+    np.testing.assert_allclose(of_b, 0.5**2 + 0.01)
 
 
 def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:

@@ -552,6 +552,20 @@ def test_emitted_light_is_given_back(render: SyntheticRender) -> None:
     assert np.abs(image[far].mean() / color.mean[far].mean() - 1) < 0.05
 
 
+def test_emission_spreads_beyond_straight_edges_only() -> None:
+    lamps = np.zeros((30, 40, 1), np.float32)
+    lamps[8, 8] = lamps[18:20, 8:10] = lamps[10:20, 20:30] = 1
+    rng = np.random.default_rng(0)
+    a, b = ((lamps * rng.uniform(20, 30, lamps.shape)).repeat(3, 2).astype(np.float32) for _ in range(2))
+    lamp = Buffer((a + b) / 2, a, b)
+    for surfaces in _surfaces(RenderBuffers(lamp, albedo=lamp)):
+        spread = (surfaces.smooth_emission > 0).all(axis=2) & (lamps[:, :, 0] == 0)
+        assert not spread[:, :18].any()
+        assert spread[12:18, 19].all()
+        assert not spread[:, :19].any()
+        assert not spread[:, 31:].any()
+
+
 def _lamps_of_few_pixels(seed: int) -> tuple[RenderBuffers, FloatImage]:
     """Four spp of 25 lamps of 1.5 x 1.5 pixels, 4000 times brighter than the wall; the truth."""
     rng = np.random.default_rng(seed)
@@ -786,7 +800,7 @@ def test_the_albedo_of_a_picture_full_of_light_is_used(
     for name in ("color", "albedo"):
         planes = getattr(render.buffers, name).planes()
         buffers[name] = Buffer(**{plane: np.where(lit, np.float32(radiance), x) for plane, x in planes})
-    known = prepared(render.buffers.with_quantities(**buffers))
+    known = prepared(render.buffers.with_quantities(**buffers), 1)
     assert known.buffers.albedo is not None
     assert not caplog.text
 
@@ -803,7 +817,7 @@ def test_an_albedo_that_may_be_in_its_scale_is_used(
     radiance: float, albedo: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     color, feature = (Buffer(np.full((1, 1, 3), value, np.float32)) for value in (radiance, albedo))
-    assert prepared(RenderBuffers(color, feature)).buffers.albedo is not None
+    assert prepared(RenderBuffers(color, feature), 1).buffers.albedo is not None
     assert "albedo" not in caplog.text
 
 

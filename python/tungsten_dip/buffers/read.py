@@ -93,8 +93,9 @@ def read_image(path: str | Path) -> FloatImage:
         try:
             owner, found = _find_layers(replace(source, mapping={"color": denoised}) if denoised else source)
         except InputError as error:
+            reason = str(error).partition("; ")[0]  # without a remedy that is none here
             raise InputError(
-                f"{path}: expected R, G, B or Y, or a layer that is the picture ({error}); name another file"
+                f"{path}: expected R, G, B or Y, or a layer that is the picture ({reason}); name another file"
             ) from error
         color = found.channels["color"]
         return _plane(path, "color", color, owner, owner[color[0]][0])

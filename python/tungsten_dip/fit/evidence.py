@@ -63,9 +63,9 @@ class Evidence:
     (height, width). ``choices`` holds both halves of the noisy image, of every pilot, of every candidate.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and the
     other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a half
-    are relative to. ``guide_noise`` is that of the pilots' guides (see
-    `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`).
-    ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
+    are relative to. ``guide_noise`` is that of the pilots' guides (see `Guides`). ``gain`` is what gives back
+    the radiance of fireflies (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result
+    (`FitResult`).
     """
 
     scale: float

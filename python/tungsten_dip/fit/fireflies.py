@@ -25,11 +25,15 @@ _LIMIT_OF_OTHER = 4.0
 """How many times brighter than in the other half: real detail is about equal in both halves."""
 
 _FEW_SAMPLES = 0.35
-"""Relative variance of a mean that some three samples carry: the same firefly may have struck both halves."""
+"""Relative variance of a mean that some three samples carry: a firefly may have struck both halves. Of four
+samples in all, two that are equal have 1/3, and pass."""
 
 _CROWD = 4
-"""So many pixels of the other half, all as bright as a pixel that they surround, are no chance: few samples
+"""So many spots of the other half, all as bright as a pixel that they surround, are no chance: few samples
 find this light."""
+
+_SPOT_RADIUS = 2
+"""A spot is the brightest of 5x5 pixels: over so many a pixel filter may spread one sample."""
 
 _CROWD_PIXELS = 1 << 12
 """Pixels whose surroundings are sorted at a time."""
@@ -78,12 +82,16 @@ def limit_fireflies(
 ) -> Limited:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    Left alone, whatever its radiance, is what is about equal in both halves, unless the ``variance`` of their
-    mean shows that few samples carry it, and no ``emission`` explains it. So is what is no brighter than four
-    of the 17x17 pixels around it are in the other half, without their emission, and everything up to 15 times
-    the mean of both halves there. Where this leaves out most of the pixels that have any light, they are the
-    image (stars, or a caustic on black), and fireflies are 15 times brighter than their median. All images
-    are linear radiance of shape (height, width, 3).
+    The halves and their ``emission`` (None: there is none) are linear radiance of shape (height, width, 3),
+    ``variance`` is that of the mean of all samples, in squared units. Pixels keep their radiance
+
+    - up to 15 times the mean of both halves in the 17x17 pixels around them;
+    - if it is about equal in both halves. If the variance is known, it must show that more than a few samples
+      carry the radiance, unless the pixel has emission;
+    - if four spots around them in the other half are as bright, beside their emission.
+
+    Where this leaves out most of the pixels that have any light, they are the image (stars, or a caustic on
+    black), and fireflies are 15 times brighter than their median.
     """
     levels = [_level(half) for half in (half_a, half_b)]
     mean = (levels[0] + levels[1]) / 2
@@ -91,7 +99,7 @@ def limit_fireflies(
     lights = [_level(light) for light in emission] if emission else [np.zeros_like(mean)] * 2
     confirmed = np.ones(mean.shape, bool)
     if variance is not None:
-        confirmed = (_level(variance) <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
+        confirmed = (_level(np.sqrt(variance)) ** 2 <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
     limits = []
     for level, other, light_of_other in zip(levels, levels[::-1], lights[::-1], strict=True):
         limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other * confirmed)
@@ -125,15 +133,29 @@ def _level(image: FloatImage) -> _Levels:
 
 
 def _crowd(struck: npt.NDArray[np.bool_], other: _Levels) -> _Levels:
-    """Return how bright the `_CROWD` brightest pixels of the other half are around those struck, else 0."""
+    """Return how bright the `_CROWD` brightest spots of the other half are around pixels struck, else 0."""
     crowd = np.zeros_like(other)
     rows, columns = np.nonzero(struck[:, :, 0])
     size = 2 * _RADIUS + 1
-    windows = sliding_window_view(np.pad(other[:, :, 0], _RADIUS), (size, size))
+    windows = sliding_window_view(np.pad(_spots(other[:, :, 0]), _RADIUS), (size, size))
     for first in range(0, len(rows), _CROWD_PIXELS):
         at = rows[first : first + _CROWD_PIXELS], columns[first : first + _CROWD_PIXELS]
         crowd[at] = np.partition(windows[at].reshape(-1, size**2), -_CROWD)[:, -_CROWD, None]
     return crowd
+
+
+def _spots(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return an image, shape (height, width), black but for the brightest of the pixels around each."""
+    height, width = image.shape
+    padded = np.pad(image, _SPOT_RADIUS)
+    brightest = np.ones(image.shape, bool)
+    side = 2 * _SPOT_RADIUS + 1
+    for dy, dx in np.ndindex(side, side):
+        beside = padded[dy : dy + height, dx : dx + width]
+        # Of equal ones the first.
+        before = (dy, dx) < (_SPOT_RADIUS, _SPOT_RADIUS)
+        brightest &= image > beside if before else image >= beside
+    return np.where(brightest, image, 0)
 
 
 def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> FloatImage:

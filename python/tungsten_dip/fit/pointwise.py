@@ -154,10 +154,9 @@ class PointwiseNetwork:
         self._members = in_parallel(stepped, self._members, self._threads)
 
     def fuse(self, inputs: FloatArray, choices: Iterable[FloatImage]) -> FloatArray:
-        """Return the mean of the choices, with the weights for ``inputs``; both as in `Examples`.
+        """Return the mean of the choices, with the weights for ``inputs``, shape (pixels, 3).
 
-        ``choices`` come one after the other, each of shape (pixels, 3) or (height, width, 3); the result has
-        shape (pixels, 3).
+        ``inputs`` are as in `Examples`, ``choices`` images of shape (pixels, 3) or (height, width, 3).
 
         Raises InputError if it is not finite.
         """

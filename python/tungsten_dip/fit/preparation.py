@@ -33,7 +33,7 @@ class Prepared:
     notes: tuple[str, ...]
 
 
-def prepared(buffers: RenderBuffers, threads: int | None = None) -> Prepared:
+def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
     """Check and sanitise the input; an albedo in another scale is left out.
 
     Raises InputError if these are no buffers or the image is empty.

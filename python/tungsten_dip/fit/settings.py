@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -36,7 +35,7 @@ class FitSettings:
     ``pilot`` names a pre-trained denoiser whose image is one more pilot, a candidate that the halves score
     like the others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and
     ``channels`` describe the network of the published method and are used by the preset ``paper`` alone.
-    ``channels`` may be any sequence. ``target_error`` is a relMSE (epsilon 0.01). ``iterations`` None
+    ``channels`` may be a list, too. ``target_error`` is a relMSE (epsilon 0.01). ``iterations`` None
     means: as the preset has it. ``threads`` None uses every core. A time or an error that is None does not
     end the fit.
 
@@ -69,8 +68,7 @@ class FitSettings:
             if value is not None:
                 object.__setattr__(self, name, positive_number(name, value))
         counts = self.channels
-        listed = isinstance(counts, Sequence) and not isinstance(counts, str)
-        if not listed or not 0 < len(counts) <= _MOST_SCALES:
+        if not isinstance(counts, (list, tuple)) or not 0 < len(counts) <= _MOST_SCALES:
             raise InputError(
                 f"channels: expected 1 to {_MOST_SCALES} counts, such as 8,16,32,64,128, got {counts!r:.40}"
             )
