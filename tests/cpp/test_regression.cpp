@@ -87,8 +87,8 @@ void constants_stay() {
 double variance_of_two_means(int radius, int step, int next) {
     std::map<int, double> weights;
     double sum = 0;
-    const auto share = [radius](int i, int step) {
-        return step > 1 && std::abs(i) == radius / step ? 0.5 : 1.0;
+    const auto share = [radius](int i, int stride) {
+        return stride > 1 && std::abs(i) == radius / stride ? 0.5 : 1.0;
     };
     for (int i = -(radius / step); i <= radius / step; ++i) {
         for (int j = -(radius / next); j <= radius / next; ++j) {
