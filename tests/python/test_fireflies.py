@@ -83,12 +83,12 @@ def test_both_halves_confirm_a_light_that_more_than_a_few_samples_or_the_albedo_
     for half in halves:
         half[5, 6] = color
     # Two of sixteen samples found it, or four of them.
-    deviation = 0.5**0.5 if case in ("few samples", "emission") else 0.5
-    variance = None if case == "no variance" else (deviation * halves[0]).astype(np.float32) ** 2
+    relative = 0.5**0.5 if case in ("few samples", "emission") else 0.5
+    deviation = None if case == "no variance" else np.float32(relative) * halves[0]
     lamp = np.zeros_like(halves[0])
     lamp[5, 6] = 900
     emission = (lamp, lamp) if case == "emission" else None
-    limited = limit_fireflies(*halves, 1, emission, variance)
+    limited = limit_fireflies(*halves, 1, emission, deviation)
     if case == "few samples":
         assert limited.note is not None
         assert limited.note.startswith("2 fireflies limited")

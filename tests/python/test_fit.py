@@ -106,6 +106,23 @@ def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: Synthe
     assert (scaled.estimated_relmse > plain.estimated_relmse) == (exponent > 0)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("exponent", [-126, -80, 80, 120])
+def test_any_exposure_is_denoised_without_overflow(exponent: int, render: SyntheticRender) -> None:
+    color = render.buffers.color
+    planes = {
+        name: np.ldexp(plane, 2 * exponent if name == "variance" else exponent)
+        for name, plane in color.planes()
+        if name != "variance" or abs(exponent) < 60
+    }
+    # A variance that float32 can hold beside any colour.
+    planes.setdefault("variance", np.full_like(color.mean, 1e-38 if exponent < 0 else 1e38))
+    result = denoise(render.buffers.with_quantities(color=Buffer(**planes)), _settings(iterations=5))
+    assert np.isfinite(result.color).all()
+    kept, given = (image.mean(dtype=np.float64) for image in (result.color, planes["mean"]))
+    assert kept == pytest.approx(given, rel=0.1)
+
+
 def test_dark_images_are_not_taken_for_clean_ones(render: SyntheticRender) -> None:
     """Without halves to trust, the exposure changes nothing either."""
     color, scale = render.buffers.color, np.float32(2.0**-21)

@@ -211,10 +211,9 @@ def _without_fireflies(buffers: RenderBuffers, scale: float, threads: int) -> tu
     color = buffers.color
     assert color.halves is not None
     half_a, half_b = (scaled(half, scale) for half in color.halves)
-    variance = None if color.variance is None else scaled(color.variance, scale**2)
-    limited = limit_fireflies(
-        half_a, half_b, threads, emission_of_halves(buffers, (half_a, half_b), scale, threads), variance
-    )
+    emission = emission_of_halves(buffers, (half_a, half_b), scale, threads)
+    deviation = None if color.variance is None else scaled(np.sqrt(color.variance), scale)
+    limited = limit_fireflies(half_a, half_b, threads, emission, deviation)
     if limited.gain is None:
         return scaled(color.mean, scale), limited
     return mean_of(limited.halves), limited

@@ -78,16 +78,17 @@ def limit_fireflies(
     half_b: FloatImage,
     threads: int,
     emission: Halves | None = None,
-    variance: FloatImage | None = None,
+    deviation: FloatImage | None = None,
 ) -> Limited:
     """Scale down pixels of one half that neither their surroundings nor the other half support.
 
-    The halves and their ``emission`` (None: there is none) are linear radiance of shape (height, width, 3),
-    ``variance`` is that of the mean of all samples, in squared units. Pixels keep their radiance
+    The halves, their ``emission`` (None: there is none) and ``deviation``, the standard deviation of the mean
+    of all samples (None: unknown), are linear radiance of shape (height, width, 3). Pixels keep their
+    radiance
 
     - up to 15 times the mean of both halves in the 17x17 pixels around them;
-    - if it is about equal in both halves. If the variance is known, it must show that more than a few samples
-      carry the radiance, unless the pixel has emission;
+    - if it is about equal in both halves. If the deviation is known, it must show that more than a few
+      samples carry the radiance, unless the pixel has emission;
     - if four spots around them in the other half are as bright, beside their emission.
 
     Where this leaves out most of the pixels that have any light, they are the image (stars, or a caustic on
@@ -98,8 +99,8 @@ def limit_fireflies(
     around = _surroundings(mean, threads)
     lights = [_level(light) for light in emission] if emission else [np.zeros_like(mean)] * 2
     confirmed = np.ones(mean.shape, bool)
-    if variance is not None:
-        confirmed = (_level(np.sqrt(variance)) ** 2 <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
+    if deviation is not None:
+        confirmed = (_level(deviation) ** 2 <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
     limits = []
     for level, other, light_of_other in zip(levels, levels[::-1], lights[::-1], strict=True):
         limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other * confirmed)
