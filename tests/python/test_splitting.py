@@ -112,3 +112,17 @@ def test_lamps_in_plain_view_are_in_both_halves_and_stray_light_is_not() -> None
     torn = (share < 0.1) | (share > 0.9)
     assert torn[lamps].mean() < 0.02
     assert torn[stray].mean() > 0.5
+
+
+def test_the_halves_of_a_lamps_rim_are_nearly_independent() -> None:
+    """A half that misses the lamp tells little of whether the other half hits it."""
+    random = np.random.default_rng(2)
+    emitted = np.zeros((40, 400), np.float32)
+    emitted[5:12] = 100
+    emitted[12] = 100 * random.binomial(4, 0.25, 400) / 4
+    color, albedo = ((emitted + base)[:, :, None].repeat(3, axis=2) for base in (0.2, 0.5))
+    albedo[emitted > 0] += 0.5
+    split = with_independent_halves(RenderBuffers(Buffer(color), Buffer(albedo)), 0, 1).buffers
+    assert split.color.halves is not None
+    a, b = (half[12, :, 0] for half in split.color.halves)
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.4

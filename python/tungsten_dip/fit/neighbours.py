@@ -1,8 +1,9 @@
-"""The pixels around a pixel: how many there are, and their mean without the pixel itself."""
+"""The pixels around a pixel: how many there are, their mean without the pixel itself, and the largest."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import FloatImage
@@ -23,3 +24,13 @@ def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
     others: FloatImage = _core.box_mean(image, radius, threads) * count - image
     others /= np.maximum(count - 1, 1)
     return others
+
+
+def largest_around(image: FloatImage, radius: int) -> FloatImage:
+    """Return the largest value of the (2 radius + 1)^2 pixels around each, of a shape (height, width, 1)."""
+    size = 2 * radius + 1
+    for axis in (0, 1):
+        margins = [(radius, radius) if axis == a else (0, 0) for a in range(3)]
+        padded = np.pad(image, margins, mode="edge")
+        image = sliding_window_view(padded, size, axis).max(axis=-1)
+    return image

@@ -22,7 +22,7 @@ from tungsten_dip.buffers.prefilter import noise_in
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.exposure import exposure, scaled
-from tungsten_dip.fit.neighbours import mean_around
+from tungsten_dip.fit.neighbours import largest_around, mean_around
 
 _Plane = npt.NDArray[np.float64]
 
@@ -41,7 +41,11 @@ _STRAY = 8 / 3
 three lit neighbours."""
 
 _LEAST_SHAPE_OF_LAMPS = 8.0
-"""Hardly any half has less than a quarter of the other one's light."""
+"""Hardly any half of a pixel that a lamp fills has less than a quarter of the other one's light."""
+
+_SAMPLES_OF_RIM = 4.0
+"""If a part p of n samples hits a lamp at its rim, the number of hits is split among halves with a variance
+that is about Beta's for the shape n p / (1 - p) (hypergeometric). Images of few samples need it most."""
 
 _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
@@ -106,20 +110,29 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     # The edges of a lamp in plain view are mistaken for noise, but no half may be without it.
     light = channel_mean(emitted)
     lit = ((light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads)))[:, :, 0]
+    least_of_lamps = np.where(lit, _least_shape_of_lamps(light)[:, :, 0], 0)
 
     def beta(level: _Plane, noise: _Plane, least: FloatArray | float) -> FloatArray:
         shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
         values = drawn.beta(shape / 2, shape / 2)
         return np.where(shape < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
 
-    share = np.repeat(
-        beta(level.sum(axis=2), noise.sum(axis=2), _LEAST_SHAPE_OF_LAMPS * lit)[:, :, None], 3, 2
-    )
+    share = np.repeat(beta(level.sum(axis=2), noise.sum(axis=2), least_of_lamps)[:, :, None], 3, 2)
     one_sample = level.sum(axis=2) < _SHAPE_OF_ONE_SAMPLE * noise.sum(axis=2)
     apart = drawn.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]
     apart &= ~lit & ~one_sample
     share[apart] = beta(level[apart], noise[apart], 0)
     return share
+
+
+def _least_shape_of_lamps(light: FloatImage) -> FloatImage:
+    """Return the least shape for pixels of which a lamp fills a part, shape (height, width, 1).
+
+    That part is a pixel's light relative to the brightest of the 3x3 pixels around it.
+    """
+    part = light / np.maximum(largest_around(light, 1), np.float32(1e-30))
+    shape: FloatImage = np.float32(_SAMPLES_OF_RIM) * part / np.maximum(1 - part, np.float32(1e-3))
+    return np.minimum(shape, np.float32(_LEAST_SHAPE_OF_LAMPS))
 
 
 def _correlation(image: FloatImage, around: FloatImage, threads: int) -> FloatImage:
