@@ -111,10 +111,23 @@ def test_light_that_few_samples_find_in_both_halves_is_kept(both: bool) -> None:
         assert kept < 0.9
 
 
+@pytest.mark.parametrize("emits", [True, False])
+def test_a_lamp_out_of_focus_supports_what_hit_it_and_nothing_else(emits: bool) -> None:
+    halves = _halves(48, 48)
+    emission = np.zeros_like(halves[0]), np.zeros_like(halves[1])
+    for index, (row, column) in enumerate(((14, 14), (17, 25), (26, 13), (20, 20))):
+        half = int(index == 3)
+        halves[half][row, column] += 1e3
+        if emits or half == 0:
+            emission[half][row, column] = 1e3
+    limited = limit_fireflies(*halves, 1, emission).halves
+    assert (limited[1][20, 20].mean() > 999) == emits
+
+
 @pytest.mark.parametrize(
     "spread",
-    [np.ones((2, 2)), np.ones((4, 4)), np.outer((1, 2, 1), (1, 2, 1))],
-    ids=["2x2", "4x4", "tent"],
+    [np.ones((2, 2)), np.outer((1, 2, 1), (1, 2, 1)), np.outer((1, 23, 23, 1), (1, 23, 23, 1))],
+    ids=["2x2", "tent", "cubic B-spline"],
 )
 def test_fireflies_that_a_pixel_filter_spread_do_not_support_those_of_the_other_half(
     spread: npt.NDArray[np.float64], monkeypatch: pytest.MonkeyPatch

@@ -211,7 +211,7 @@ def _without_fireflies(buffers: RenderBuffers, scale: float, threads: int) -> tu
     color = buffers.color
     assert color.halves is not None
     half_a, half_b = (scaled(half, scale) for half in color.halves)
-    emission = emission_of_halves(buffers, (half_a, half_b), scale, threads)
+    emission = emission_of_halves(buffers, (half_a, half_b), scale)
     deviation = None if color.variance is None else scaled(np.sqrt(color.variance), scale)
     limited = limit_fireflies(half_a, half_b, threads, emission, deviation)
     if limited.gain is None:

@@ -28,9 +28,9 @@ _FEW_SAMPLES = 0.35
 """Relative variance of a mean that some three samples carry: a firefly may have struck both halves. Of four
 samples in all, two that are equal have 1/3, and pass."""
 
-_CROWD = 4
+_CROWD = 3
 """So many spots of the other half, all as bright as a pixel that they surround, are no chance: few samples
-find this light."""
+find this light, such as a lamp out of focus or a caustic."""
 
 _SPOT_RADIUS = 2
 """A spot is the brightest of 5x5 pixels: over so many a pixel filter may spread one sample."""
@@ -89,7 +89,8 @@ def limit_fireflies(
     - up to 15 times the mean of both halves in the 17x17 pixels around them;
     - if it is about equal in both halves. If the deviation is known, it must show that more than a few
       samples carry the radiance, unless the pixel has emission;
-    - if four spots around them in the other half are as bright, beside their emission.
+    - if three spots around them in the other half are as bright: in emission, if theirs is mostly emission,
+      and else without it. A lamp beside a firefly tells nothing of it.
 
     Where this leaves out most of the pixels that have any light, they are the image (stars, or a caustic on
     black), and fireflies are 15 times brighter than their median.
@@ -102,9 +103,13 @@ def limit_fireflies(
     if deviation is not None:
         confirmed = (_level(deviation) ** 2 <= _FEW_SAMPLES * mean**2) | (lights[0] + lights[1] > 0)
     limits = []
-    for level, other, light_of_other in zip(levels, levels[::-1], lights[::-1], strict=True):
+    for half, level in enumerate(levels):
+        other, light_of_other = levels[1 - half], lights[1 - half]
         limit = np.maximum(_LIMIT * around, _LIMIT_OF_OTHER * other * confirmed)
-        limits.append(np.maximum(limit, _crowd(level > limit, np.maximum(other - light_of_other, 0))))
+        emits = 2 * lights[half] > level
+        for kind, of_other in ((emits, light_of_other), (~emits, np.maximum(other - light_of_other, 0))):
+            limit = np.maximum(limit, _crowd(kind & (level > limit), of_other))
+        limits.append(limit)
     count = sum(int(np.count_nonzero(level > limit)) for level, limit in zip(levels, limits, strict=True))
     lit = sum(int(np.count_nonzero(level)) for level in levels)
     if 2 * count > lit:

@@ -131,8 +131,8 @@ def _least_shape_of_lamps(light: FloatImage) -> FloatImage:
     That part is a pixel's light relative to the brightest of the 3x3 pixels around it.
     """
     part = light / np.maximum(largest_around(light, 1), np.float32(1e-30))
-    shape: FloatImage = np.float32(_SAMPLES_OF_RIM) * part / np.maximum(1 - part, np.float32(1e-3))
-    return np.minimum(shape, np.float32(_LEAST_SHAPE_OF_LAMPS))
+    unfilled = np.maximum(np.float32(1) - part, np.float32(1e-3))
+    return np.minimum(np.float32(_SAMPLES_OF_RIM) * part / unfilled, np.float32(_LEAST_SHAPE_OF_LAMPS))
 
 
 def _correlation(image: FloatImage, around: FloatImage, threads: int) -> FloatImage:

@@ -42,8 +42,9 @@ _LIT_AROUND = 2.5 / 9
 """Beside the straight edge of a lamp, a third of the 3x3 pixels is lit; beside a lamp of few pixels, less."""
 
 _STRAY = 4.0
-_STRAY_RADIUS = 2
-"""Emission of one half more than so many times the sum over the other half's 5x5 pixels was hit by chance."""
+_STRAY_AROUND = 0.6
+"""Emission of one half was hit by chance beyond so many times the other half's, or that of all other pixels
+of both halves' 3x3, in which two about as bright thus suffice."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def surfaces_of_halves(
     )
 
 
-def emission_of_halves(buffers: RenderBuffers, colors: Halves, scale: float, threads: int) -> Halves | None:
+def emission_of_halves(buffers: RenderBuffers, colors: Halves, scale: float) -> Halves | None:
     """Return the radiance emitted towards the samples of each half, if there is any.
 
     ``colors`` and the results are linear radiance times ``scale``, shape (height, width, 3), of sanitised
@@ -140,7 +141,7 @@ def emission_of_halves(buffers: RenderBuffers, colors: Halves, scale: float, thr
     """
     if buffers.albedo is None or not (buffers.albedo.mean > 1).any():
         return None
-    albedos = _bounded_albedos(_without_stray_emission(buffers.albedo, threads), colors, scale)
+    albedos = _bounded_albedos(buffers.albedo, colors, scale)
     a, b = (np.maximum(albedo - 1, 0) * np.float32(scale) for albedo in albedos)
     return a, b
 
@@ -228,20 +229,20 @@ def _smooth_emission(
 
 
 def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
-    """Return an albedo above 1 only where both halves saw emission, in about the same place.
+    """Return an albedo above 1 only where both halves or several pixels around saw about as much emission.
 
-    A path that hit a light through glass or a mirror by chance is noise, and remains in the colour: as
-    emission it would not be denoised.
+    A path that hit a light out of focus, or through glass or a mirror, by chance is noise, and remains in the
+    colour: as emission it would not be denoised.
     """
     if albedo.halves is None or not (albedo.mean > 1).any():
         return albedo
-    a, b = albedo.halves
-    limits = (
-        1 + np.float32(_STRAY * (2 * _STRAY_RADIUS + 1) ** 2) * around
-        for around in (_core.box_mean(np.maximum(half - 1, 0), _STRAY_RADIUS, threads) for half in (b, a))
+    emissions = [np.maximum(half - 1, 0) for half in albedo.halves]
+    around = np.float32(2 * 3**2) * _core.box_mean(mean_of((emissions[0], emissions[1])), 1, threads)
+    kept_a, kept_b = (
+        np.minimum(half, 1 + np.maximum(_STRAY * other, _STRAY_AROUND * (around - own)))
+        for half, own, other in zip(albedo.halves, emissions, emissions[::-1], strict=True)
     )
-    kept_a, kept_b = (np.minimum(half, limit) for half, limit in zip((a, b), limits, strict=True))
-    taken = mean_of((a - kept_a, b - kept_b))
+    taken = mean_of((albedo.halves[0] - kept_a, albedo.halves[1] - kept_b))
     return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
 
 
