@@ -219,7 +219,7 @@ def test_what_no_renderer_can_mean_stays_out(value: float, halves: bool, make_re
         if name == "color" and not halves:
             planes = {"mean": planes["mean"], "variance": planes["variance"]}
         for array in planes.values():
-            array[rng.integers(20, size=3), rng.integers(24, size=3)] = value
+            array[rng.integers(20, size=2), rng.integers(24, size=2)] = value
         broken[name] = Buffer(**planes)
     result = denoise(buffers.with_quantities(**broken), _settings(iterations=5))
     check_result(result, buffers)
@@ -639,7 +639,7 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
 
     for halves, emission in ((("half_a",), [0.0, 0.0]), (("half_a", "half_b"), [30.0, 30.0])):
         found = [s.emission[20, 30].mean() for s in _surfaces(with_lamp(*halves))]
-        np.testing.assert_allclose(found, emission, rtol=0.05)
+        np.testing.assert_allclose(found, emission, rtol=0.05, atol=1e-5)
     image = denoise(with_lamp("half_a"), _settings(iterations=20)).color
     around = np.delete(image[18:23, 28:33].reshape(25, 3), 12, axis=0)
     assert image[20, 30].mean() < 2 * around.mean()
