@@ -13,7 +13,8 @@ from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.buffers.render_buffers import FloatArray
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, network_inputs
+from tungsten_dip.fit.evidence import with_best_baseline
+from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, loss_weights, network_inputs
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights, training_step, weight_shapes
@@ -39,6 +40,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     for name, value in weights.items():
         weights[name] = value + rng.normal(0, 0.3, value.shape).astype(np.float32)
     batch = examples.at(rng.integers(2 * 480, size=pixels))
+    batch.target[0] += 1e3
 
     in_torch = TorchNetwork(weights)
     in_onnx = PointwiseNetwork(weights, len(layout.inputs), layout.choice_count, "cpu")
@@ -60,14 +62,13 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
 
     expected = np.concatenate([part.numpy().ravel() for part in in_torch.gradients(batch)])
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    squared = (fused(in_onnx, batch) - batch.target) ** 2 * batch.weight
-    assert loss == pytest.approx(squared.mean(), rel=1e-4)
+    assert loss == pytest.approx(in_torch.loss(batch).item(), rel=1e-4)
 
     for _ in range(5):
         for network in (in_torch, in_onnx):
             network.step(batch, 1e-2)
     for name, value in in_torch.weights().items():
-        np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-3, atol=1e-3)
 
 
 def fused(network: PointwiseNetwork, examples: Examples) -> FloatArray:
@@ -93,7 +94,8 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
         np.testing.assert_array_equal(value, np.concatenate([network.weights()[name] for network in alone]))
 
 
-def test_gradients_are_those_of_the_loss() -> None:
+@pytest.mark.parametrize("outlier", [1.0, 1e3])
+def test_gradients_are_those_of_the_loss(outlier: float) -> None:
     """Against central differences in double precision, without torch."""
     rng = np.random.default_rng(0)
     inputs, choices, pixels = 3, 2, 5
@@ -105,6 +107,7 @@ def test_gradients_are_those_of_the_loss() -> None:
         "target": rng.random((pixels, 3)),
         "weight": rng.random((pixels, 1)),
     }
+    feeds["target"][0] *= outlier
 
     def loss(weights: Any) -> float:
         x, first = feeds["inputs"], 0
@@ -118,7 +121,9 @@ def test_gradients_are_those_of_the_loss() -> None:
             x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
         shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
         fused = (shares[:, :, None] * feeds["choices"]).sum(1)
-        return float(np.mean(feeds["weight"] * (fused - feeds["target"]) ** 2))
+        error = np.sqrt((feeds["weight"] * (fused - feeds["target"]) ** 2).mean(axis=1))
+        assert (error > 30).any() == (outlier > 1)
+        return float(np.where(error > 30, 60 * error - 900, error**2).mean())
 
     expected = [(loss(vector + d) - loss(vector - d)) / 2e-6 for d in 1e-6 * np.eye(vector.size)]
     zeros = np.zeros(vector.size, np.float32)
@@ -151,14 +156,34 @@ def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
     np.testing.assert_allclose(lower[:, -inner:], whole[:, -inner:], rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("changed", ["seen", "scoring"])
-def test_the_network_sees_the_noise_of_no_pixel_at_that_pixel(changed: str, frame: SyntheticRender) -> None:
-    # Neither the half's own, which it would choose for being dark, nor the other's, which it is scored by.
+def test_the_network_sees_its_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
+    """Or it would choose a noisy pixel for being dark."""
     evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
     y, x, half = 11, 17, 0
     noisy = [image.copy() for image in evidence.halves]
-    noisy[half if changed == "seen" else 1 - half][y, x] *= 3
+    noisy[half][y, x] *= 3
     other = replace(evidence, choices=((noisy[0], noisy[1]), *evidence.choices[1:]))
     before, after = (np.stack(list(inputs_of_half(e, half)), axis=2) for e in (evidence, other))
     np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
     assert np.abs(after - before).max() > 0.01
+
+
+def test_the_network_sees_the_scoring_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
+    """Nor may the weight of the pixel in the loss depend on it, or the image would darken."""
+    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    before = np.stack(list(inputs_of_half(evidence, 0)), axis=2)
+    largest_change = 0.0
+    for y in range(3, 32, 4):
+        for x in range(3, 48, 4):
+            noisy = evidence.halves[1].copy()
+            noisy[y, x] = 5 * noisy[y, x] + 0.1
+            changed = replace(evidence, choices=((evidence.halves[0], noisy), *evidence.choices[1:]))
+            # As a fit does: the noise is estimated with the same half.
+            changed = with_best_baseline(changed)
+            assert changed.layout == evidence.layout
+            after = np.stack(list(inputs_of_half(changed, 0)), axis=2)
+            np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
+            largest_change = max(largest_change, float(np.abs(after - before).max()))
+            weights = (loss_weights(e)[0][y, x, 0] for e in (evidence, changed))
+            assert next(weights) == pytest.approx(next(weights), rel=1e-3)
+    assert largest_change > 0.1

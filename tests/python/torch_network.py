@@ -24,7 +24,8 @@ class TorchNetwork:
 
     def loss(self, batch: Examples) -> Tensor:
         target, weight = torch.from_numpy(batch.target), torch.from_numpy(batch.weight)
-        return ((self._fused(batch) - target) ** 2 * weight).mean()
+        error = ((self._fused(batch) - target) ** 2 * weight).mean(dim=1).sqrt()
+        return 2 * nn.functional.huber_loss(error, torch.zeros_like(error), delta=30)
 
     def gradients(self, batch: Examples) -> tuple[Tensor, ...]:
         return torch.autograd.grad(self.loss(batch), list(self._parameters.values()))

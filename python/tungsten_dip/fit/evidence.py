@@ -44,8 +44,11 @@ _NOISE_RADIUS = 8
 _NEAR_RADIUS = 2
 """Radius of the window in which no sample may have hit anything, for a pixel to be empty space."""
 
-OUTLIER = 20.0
-"""Squared errors are capped at so many times the local mean where local noise is estimated from them."""
+_OUTLIER = 20.0
+"""Squared errors are capped at so many times what those by a half itself are in the pixels around."""
+
+_LEAST_CAP = 1e-3
+"""Errors up to here are never capped as outliers."""
 
 _BAND_ROWS = 64
 """Rows of all pilots that are sorted at a time: large images need gigabytes for each copy."""
@@ -63,9 +66,10 @@ class Evidence:
     (height, width). ``choices`` holds both halves of the noisy image, of every pilot, of every candidate.
     ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and the
     other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a half
-    are relative to. ``guide_noise`` is that of the pilots' guides (see `Guides`). ``gain`` is what gives back
-    the radiance of fireflies (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result
-    (`FitResult`).
+    are relative to. Errors count up to ``caps``, which are made from the half itself, so that neither noise
+    nor scores of a pixel depend on its value in the half that scores it. ``guide_noise`` is that of the
+    pilots' guides (see `Guides`). ``gain`` is what gives back the radiance of fireflies
+    (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
 
     scale: float
@@ -75,6 +79,7 @@ class Evidence:
     choices: tuple[Halves, ...]
     noises: Halves
     denominators: Halves
+    caps: Halves
     guide_noise: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
@@ -105,6 +110,7 @@ class Evidence:
             choices=tuple(cut(choice) for choice in self.choices),
             noises=cut(self.noises),
             denominators=cut(self.denominators),
+            caps=cut(self.caps),
             guide_noise=self.guide_noise[first:end],
             gain=None if self.gain is None else self.gain[first:end],
         )
@@ -154,7 +160,8 @@ def evidence_from_buffers(
     if layout is None:
         baseline = _best(choices, denominators)
         layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), baseline)
-    noises = _noises(_errors(choices[layout.baseline], halves, denominators), threads)
+    caps = _caps(choices, denominators, threads)
+    noises = _noises(_errors(choices[layout.baseline], halves, denominators), caps, threads)
     features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
     notes = (*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes)
     return Evidence(
@@ -165,6 +172,7 @@ def evidence_from_buffers(
         choices=choices,
         noises=noises,
         denominators=denominators,
+        caps=caps,
         guide_noise=guides.noise,
         gain=limited.gain,
         halves_drawn=image.drawn,
@@ -267,7 +275,8 @@ def with_best_baseline(evidence: Evidence) -> Evidence:
     """Return the same evidence with the pilot that is best on this image as the baseline."""
     choices, denominators = evidence.choices, evidence.denominators
     baseline = _best(choices, denominators)
-    noises = _noises(_errors(choices[baseline], evidence.halves, denominators), evidence.threads)
+    errors = _errors(choices[baseline], evidence.halves, denominators)
+    noises = _noises(errors, evidence.caps, evidence.threads)
     return replace(evidence, layout=replace(evidence.layout, baseline=baseline), noises=noises)
 
 
@@ -280,12 +289,26 @@ def _best(choices: Sequence[Halves], denominators: Halves) -> int:
     return 1 + int(np.argmin(mean_errors))
 
 
-def _noises(errors_of_baseline: Halves, threads: int) -> Halves:
+def _caps(choices: Sequence[Halves], denominators: Halves, threads: int) -> Halves:
+    """Return `Evidence.caps`, from the mean error of each half's choices by that half itself."""
+
+    def cap(half: int) -> FloatImage:
+        errors = (
+            relative_error(choice[half], choices[0][half], denominators[half]) for choice in choices[1:]
+        )
+        mean = sum(errors, np.zeros_like(denominators[half])) / np.float32(len(choices) - 1)
+        around = _core.box_mean(mean, _NOISE_RADIUS, threads)
+        return np.float32(_OUTLIER) * around + np.float32(_LEAST_CAP)
+
+    return cap(0), cap(1)
+
+
+def _noises(errors_of_baseline: Halves, caps: Halves, threads: int) -> Halves:
     """Return `Evidence.noises`."""
     a, b = (
         # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
-        np.maximum(mean_around(_capped(error, threads), _NOISE_RADIUS, threads), 0)
-        for error in errors_of_baseline
+        np.maximum(mean_around(np.minimum(error, cap), _NOISE_RADIUS, threads), 0)
+        for error, cap in zip(errors_of_baseline, caps, strict=True)
     )
     return a, b
 
@@ -358,9 +381,3 @@ def relative_error(image: FloatImage, other: FloatImage, denominator: FloatImage
     """Return the mean squared difference of the channels over a denominator, shape (height, width, 1)."""
     error: FloatImage = channel_mean((image - other) ** 2) / denominator
     return error
-
-
-def _capped(error: FloatImage, threads: int) -> FloatImage:
-    limit = np.float32(OUTLIER) * _core.box_mean(error, _NOISE_RADIUS, threads)
-    capped: FloatImage = np.minimum(error, limit)
-    return capped

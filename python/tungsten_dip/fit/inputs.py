@@ -15,11 +15,7 @@ import numpy as np
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
-from tungsten_dip.fit.evidence import (
-    OUTLIER,
-    Evidence,
-    relative_error,
-)
+from tungsten_dip.fit.evidence import Evidence, relative_error
 from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around
 
@@ -32,9 +28,6 @@ _LOG_OFFSET = 0.02
 
 _LEAST_ERROR = 1e-4
 """Smaller errors, 1% of the radiance, do not differ."""
-
-_LEAST_CAP = 1e-3
-"""Errors up to here are never capped as outliers."""
 
 _LARGEST_BRIGHTNESS = 2.0
 """Pilots more than e^2 times brighter than the baseline, or darker, are as far off."""
@@ -80,7 +73,7 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     other = evidence.halves[1 - half]
     denominator = evidence.denominators[half]
     unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
-    cap = np.float32(OUTLIER) * noise + np.float32(_LEAST_CAP)
+    cap = evidence.caps[half]
     baseline = np.minimum(relative_error(evidence.choices[layout.baseline][half], other, denominator), cap)
     for index, choice in enumerate(evidence.choices):
         if index == layout.baseline:

@@ -33,6 +33,10 @@ ADAM_EPSILON = 1e-8
 _HEAD_START = 1.0
 """Logit that the best single pilot starts with."""
 
+_LARGEST_ERROR = 30.0
+"""A pixel's weighted error that pulls no harder however much larger it is (Huber 1964): a hundred pixels that
+one half's samples found by chance would teach the network all it learns."""
+
 _RUN_PIXELS = 1 << 14
 """Pixels that the network processes at once: the outputs of its layers stay in the processor's cache."""
 
@@ -251,16 +255,26 @@ class _Step(GraphBuilder):
         return known
 
     def gradient(self, shapes: dict[str, tuple[int, ...]]) -> str:
-        """Compute ``loss`` and return its derivatives by the weights, as one vector."""
+        """Compute ``loss`` and return its derivatives by the weights, as one vector.
+
+        Of pixels whose error exceeds `_LARGEST_ERROR`, the derivatives are those of Huber's loss.
+        """
         known = self.forward(shapes)
         target, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("target", "weight"))
         difference = self.add("Sub", known["mixed"], target)
         weighted = self.add("Mul", difference, weight)
-        self.add("ReduceMean", self.add("Mul", weighted, difference), keepdims=0, output="loss")
+        squared = self.add("ReduceMean", self.add("Mul", weighted, difference), self.integers(0))
+        error, most = self.add("Sqrt", squared), self.number(_LARGEST_ERROR)
+        bounded = self.add("Min", error, most)
+        beyond = self.add("Sub", self.add("Add", error, error), bounded)
+        self.add("ReduceMean", self.add("Mul", bounded, beyond), keepdims=0, output="loss")
 
-        # loss = mean over pixels and channels of weight * difference^2
+        # loss = mean over pixels of e^2, beyond m of 2 m e - m^2, where m is `_LARGEST_ERROR` and
+        # e^2 = mean over channels of weight * difference^2
         count = self.add("Cast", self.add("Size", "target"), to=onnx.TensorProto.FLOAT)
-        by_mixed = self.add("Mul", weighted, self.add("Div", self.number(2), count))
+        pull = self.add("Div", most, self.add("Max", error, most))
+        twice = self.add("Mul", pull, self.add("Div", self.number(2), count))
+        by_mixed = self.add("Mul", weighted, twice)
         by_share = self.add(
             "ReduceSum", self.add("Mul", known["choices"], by_mixed), self.integers(1), keepdims=0
         )
