@@ -10,7 +10,7 @@ import pytest
 from conftest import MakeRender
 from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, _denominators, _noises
+from tungsten_dip.fit.evidence import Evidence, _caps, _denominators, _noises
 from tungsten_dip.fit.exposure import unscaled
 from tungsten_dip.fit.inputs import loss_weights
 from tungsten_dip.fit.pilots import PilotMaker
@@ -66,11 +66,15 @@ def test_errors_are_relative_to_the_darker_of_the_last_pilot_and_the_median_one(
 
 
 def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:
-    """It counts as 20 times the mean of the 17x17 pixels around."""
+    """It counts as 20 times the mean error of the other half in the 17x17 pixels around."""
+    noisy, flat = np.ones((40, 40, 3), np.float32), np.zeros((40, 40, 3), np.float32)
+    choices, ones = ((noisy, noisy), (flat, flat)), np.ones((40, 40, 1), np.float32)
+    caps = _caps(choices, (ones, ones), 1)
+    np.testing.assert_allclose(caps[0], 20, rtol=1e-3)
     error = np.zeros((40, 40, 1), np.float32)
     error[20, 20] = 1e6
-    noise, _ = _noises((error, error), 1)
-    assert noise[18, 22, 0] == pytest.approx(20 * (1e6 / 17**2) / (17**2 - 1), rel=1e-3)
+    noise, _ = _noises((error, error), caps, 1)
+    assert noise[18, 22, 0] == pytest.approx(20 / (17**2 - 1), rel=1e-3)
 
 
 def test_radiance_that_the_renderers_units_cannot_hold_is_the_largest_number() -> None:

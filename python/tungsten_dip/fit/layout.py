@@ -54,7 +54,7 @@ class Layout:
             "noise",
             "level",
             *(
-                f"pilot {index} {what}"
+                f"choice {index} {what}"
                 for index in range(self.choice_count)
                 if index != self.baseline
                 for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
