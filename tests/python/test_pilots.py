@@ -54,6 +54,16 @@ def test_light_that_neither_the_other_half_nor_pixels_around_see_is_stray() -> N
     assert _surfaces((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
 
 
+def test_the_sun_is_not_smeared_over_the_sky() -> None:
+    """The sky emits too, a little."""
+    sky = np.full((40, 48), 2.0)
+    sky[20:22, 30:32] = 5e4
+    for surfaces in _surfaces((sky, sky)):
+        beside = surfaces.smooth_emission[sky == 2]
+        assert beside.max() <= 4 * 2 + 1e-5
+        assert surfaces.smooth_emission[sky > 2].min() > 0.5 * 5e4
+
+
 def test_light_that_the_colour_does_not_hold_is_an_outlier() -> None:
     light = np.zeros((20, 24))
     light[8:12, 9:14] = 1000.0

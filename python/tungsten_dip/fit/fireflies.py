@@ -142,6 +142,8 @@ def _crowd(struck: npt.NDArray[np.bool_], other: _Levels) -> _Levels:
     """Return how bright the `_CROWD` brightest spots of the other half are around pixels struck, else 0."""
     crowd = np.zeros_like(other)
     rows, columns = np.nonzero(struck[:, :, 0])
+    if not rows.size:
+        return crowd
     size = 2 * _RADIUS + 1
     windows = sliding_window_view(np.pad(_spots(other[:, :, 0]), _RADIUS), (size, size))
     for first in range(0, len(rows), _CROWD_PIXELS):

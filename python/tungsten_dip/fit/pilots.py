@@ -40,9 +40,10 @@ _SECOND_GUIDE = Pilot(radius=8, k=1.0, step=2)
 
 _EDGES = Pilot(EDGES_RADIUS, along_edges=True)
 
-# In order of cost. Small windows keep detail, large ones average out the remaining noise; guided ones keep
-# shadows and reflections, which no feature contains; a regression on the position follows gradients. Errors
-# are relative to the last one that is computed, or to the median.
+# Small windows keep detail, large ones average out the remaining noise; guided ones keep shadows and
+# reflections, which no feature contains; a regression on the position follows gradients. Within a time budget
+# the first ones are computed, so that cheap ones come first. Errors are relative to the last one that is
+# computed, or to the median.
 DRAFT_PILOTS = (Pilot(1), _EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
 BALANCED_PILOTS = (
     Pilot(1),

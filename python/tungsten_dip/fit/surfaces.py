@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
@@ -38,8 +39,9 @@ _ACROSS_EDGES = 0.3
 
 _CHANNELS = {"albedo": "RGB", "alpha": "A", "normal": "XYZ", "depth": "Z"}
 
-_LIT_AROUND = 2.5 / 9
-"""Beside the straight edge of a lamp, a third of the 3x3 pixels is lit; beside a lamp of few pixels, less."""
+_MOST_SMEARED = 4.0
+"""Smoothed emission is at most so many times a pixel's own or that of the third brightest of the 3x3 pixels
+around it: beside the straight edge of a lamp three are lit, beside a lamp of few pixels, or the sun, less."""
 
 _STRAY = 4.0
 _STRAY_AROUND = 0.6
@@ -222,10 +224,14 @@ def _smooth_emission(
 ) -> FloatImage:
     # The pre-filter blurs long edges of bright lights, the mean along edges their corners, and both smear
     # lamps of few pixels.
-    lit = (channel_mean(emission) > 0).astype(np.float32)
-    beside = _core.box_mean(lit, 1, threads) > _LIT_AROUND
     smooth: FloatImage = np.float32(0.5) * (filtered + along_edges(emission, edges, EDGES_RADIUS, threads))
-    return smooth * np.maximum(lit, beside)
+    own, level = channel_mean(emission)[:, :, 0], channel_mean(smooth)[:, :, 0]
+    smeared = np.nonzero(level > np.float32(_MOST_SMEARED) * own)
+    windows = sliding_window_view(np.pad(own, 1, mode="edge"), (3, 3))
+    third = np.partition(windows[smeared].reshape(-1, 9), 6, axis=1)[:, 6]
+    most = np.float32(_MOST_SMEARED) * np.maximum(own[smeared], third)
+    smooth[smeared] *= np.minimum(most / level[smeared], 1)[:, None]
+    return smooth
 
 
 def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
