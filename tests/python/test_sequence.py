@@ -14,7 +14,7 @@ from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import pointwise
+from tungsten_dip.fit import pointwise, training
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -470,6 +470,24 @@ def test_the_network_of_followed_frames_is_trained_in_full(tmp_path):
     follower = Follower(replace(DRAFT, iterations=5))
     followed = [follower.denoise(frame.buffers, frame.camera).result for frame in frames]
     assert [result.iterations for result in followed] == [5, 240]
+
+
+@pytest.mark.parametrize("refit", ["auto", 3])
+@pytest.mark.parametrize(
+    ("with_cameras", "how", "steps"),
+    [(True, "followed", [80, 240, 240]), (False, "cut", [80, 80, 80])],
+)
+def test_a_new_network_is_trained_in_full_whatever_the_refit(
+    tmp_path, monkeypatch, refit, with_cameras, how, steps
+):
+    monkeypatch.setattr(training, "_STRANGE", -1.0)  # so that no network applies to another frame
+    follower = Follower(DRAFT, refit)
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(3)]
+    followed = [follower.denoise(frame.buffers, frame.camera if with_cameras else None) for frame in frames]
+    assert [f.how for f in followed] == ["fitted", how, how]
+    assert [f.result.iterations for f in followed] == steps
+    newest = follower.models.following if with_cameras else follower.models.alone
+    assert newest is followed[2].result.model
 
 
 @pytest.mark.parametrize("refit", [0, 3])

@@ -75,8 +75,12 @@ def fit_fusion(
     progress: Progress,
     warm_start: Model | None = None,
     previous: Halves | None = None,
+    refit_steps: int | None = None,
 ) -> FitResult:
     """Denoise sanitised buffers; see `tungsten_dip.fit.denoise`.
+
+    ``refit_steps`` takes the place of the settings' iterations if the network of ``warm_start`` is trained
+    further, not if a new one is fitted.
 
     ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
     the shape of the colour, NaN where they have no value. They are a candidate and a guide, with which fewer
@@ -93,6 +97,8 @@ def fit_fusion(
     chosen = layout or _pilots(buffers, settings, preset, following)
     evidence = evidence_from_buffers(halved, settings, chosen, clock, progress, previous)
     start = start_of_training(evidence, settings.seed, warm_start, preset.members)
+    if start.warm and refit_steps is not None:
+        settings = replace(settings, iterations=refit_steps)
     evidence = start.evidence
     network = PointwiseNetwork(
         start.weights,

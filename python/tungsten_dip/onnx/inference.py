@@ -11,11 +11,11 @@ from tungsten_dip.buffers.display import radiance_from_ldr
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
-from tungsten_dip.fit import check_ready, denoise
+from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.fusion import blends_all_samples, fused_images
+from tungsten_dip.fit.fusion import blends_all_samples, fit_fusion, fused_images
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
@@ -43,21 +43,22 @@ def infer(
 
     ``buffers`` are as in `tungsten_dip.denoise`, with the features of the fit. ``threads`` None uses every
     core. With ``refit_steps``, a pointwise network is first trained further on this image, as by a warm
-    start, for so many steps at most; the result's ``model`` is then the refined one. A network of the preset
-    paper outputs the image itself, and its error is not estimated.
+    start, for so many steps at most; the result's ``model`` is then the refined one. An image too unlike the
+    model's gets a new network instead, with all the steps of a fit. A network of the preset paper outputs the
+    image itself, and its error is not estimated.
 
     Raises InputError if the image is empty, the model does not fit it or gives no finite image for it, or
     refit_steps cannot be done.
     """
     check_type("model", model, Model, "load_model reads one from a file")
     settings = inference_settings(model, threads, refit_steps)
-    if model.layout is not None and refit_steps:
-        return denoise(buffers, settings, progress, warm_start=model)
     known = prepared(buffers, threads)
-    if model.layout is not None:
-        result = infer_fusion(model, known.buffers, settings, progress)
-    else:
+    if model.layout is None:
         result = _infer_paper(model, known.buffers, settings, progress)
+    elif refit_steps:
+        result = fit_fusion(known.buffers, settings, progress, model, refit_steps=refit_steps)
+    else:
+        result = infer_fusion(model, known.buffers, settings, progress)
     return completed(result, known)
 
 
@@ -66,8 +67,8 @@ def inference_settings(model: Model, threads: int | None, refit_steps: int) -> F
 
     Raises InputError if these cannot be done, or a package is missing.
     """
-    refit_steps = whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
-    settings = replace(model.settings, threads=threads, iterations=refit_steps or None)
+    whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
+    settings = replace(model.settings, threads=threads, iterations=None)
     if model.layout is not None:
         check_ready(settings)
     elif refit_steps:

@@ -36,6 +36,9 @@ Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
 _MOST_STEPS = 240
+"""Of a network that is trained further, and of a new one for frames that follow: as many as one network by
+itself needs (`fit.fusion`)."""
+
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
 
@@ -126,8 +129,9 @@ class Follower:
             how, followed = "cut", None
         if followed is None:
             followed = Followed(fit_fusion(buffers, self._settings, progress), how)
-            self.models = replace(self.models, alone=followed.result.model)
         result = followed.result
+        if followed.how != "followed":
+            self.models = replace(self.models, alone=result.model)
         if self._last is None:
             self.models = replace(self.models, first=result.model)
         if result.gain is not None:
@@ -166,25 +170,24 @@ class Follower:
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
         model = self.models.alone if moved is None else self.models.following
-        if model is not None:
-            steps = _MOST_STEPS if self._refit == "auto" else self._refit
-            settings = replace(self._settings, iterations=steps or None)
-            try:
-                if steps == 0:
-                    result = infer_fusion(model, buffers, settings, progress, previous=moved)
-                else:
-                    result = fit_fusion(buffers, settings, progress, warm_start=model, previous=moved)
-            except InputError as problem:
-                if last is None:
-                    raise  # The model was made for something else.
-                if moved is not None:  # Those that come will be like this one: they get another network.
-                    self.models = replace(self.models, following=None)
-                raise _CutError(str(problem)) from problem
-        elif moved is not None:
-            settings = replace(self._settings, iterations=_MOST_STEPS)
-            result = fit_fusion(buffers, settings, progress, previous=moved)
-        else:
+        if model is None and moved is None:
             return None
+        steps = _MOST_STEPS if self._refit == "auto" else self._refit
+        try:
+            if model is not None and steps == 0:
+                result = infer_fusion(model, buffers, self._settings, progress, previous=moved)
+            else:
+                of_new = self._settings.iterations if moved is None else _MOST_STEPS
+                settings = replace(self._settings, iterations=of_new)
+                result = fit_fusion(buffers, settings, progress, model, moved, refit_steps=steps)
+        except InputError as problem:
+            if last is None:
+                raise  # The model was made for something else.
+            if moved is not None:  # Those that come will be like this one: they get another network.
+                self.models = replace(self.models, following=None)
+            raise _CutError(str(problem)) from problem
+        if moved is None and _is_new(result.model, model):
+            return Followed(result, "fitted" if last is None else "cut")
         error = _typical_error(result)
         if result.interrupted:
             error = None  # of a fit that was cut short
@@ -200,6 +203,11 @@ class Follower:
 
 class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
+
+
+def _is_new(network: Model | None, model: Model | None) -> bool:
+    """Whether a result has a network of its own: ``model`` keeps its constants when it is trained further."""
+    return network is not None and (model is None or network.standardisation is not model.standardisation)
 
 
 def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int | None) -> Halves | None:
