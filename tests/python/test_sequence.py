@@ -531,6 +531,25 @@ def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path, make_render):
     assert follower.denoise(make_render(20, 30).buffers).how == "cut"
 
 
+@pytest.mark.parametrize("by", ["sight", "size", "error"])
+def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, make_render, by):
+    follower = Follower(DRAFT, 0)
+    for n in range(2):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        follower.denoise(frame.buffers, frame.camera)
+    assert follower.models.following is not None
+    first = follower.models.first
+    frame = true_frame(tmp_path, 30.0 if by == "sight" else 0.1, seed=2)
+    if by == "error":
+        follower._error = 1e-12  # any error is so far above it that it tells of a cut
+    if by == "size":
+        cut = follower.denoise(make_render(20, 30).buffers)
+    else:
+        cut = follower.denoise(frame.buffers, frame.camera)
+    assert cut.how == "cut"
+    assert follower.models == Models(alone=cut.result.model, following=None, first=first)
+
+
 def test_a_frame_without_noise_makes_no_cut_of_the_next_one(make_render):
     follower = Follower(DRAFT)
     card = make_render(spp=10**9).buffers

@@ -131,7 +131,8 @@ class Follower:
             followed = Followed(fit_fusion(buffers, self._settings, progress), how)
         result = followed.result
         if followed.how != "followed":
-            self.models = replace(self.models, alone=result.model)
+            # A network for frames that follow was fitted to what came before the cut.
+            self.models = Models(alone=result.model, first=self.models.first)
         if self._last is None:
             self.models = replace(self.models, first=result.model)
         if result.gain is not None:
@@ -183,8 +184,6 @@ class Follower:
         except InputError as problem:
             if last is None:
                 raise  # The model was made for something else.
-            if moved is not None:  # Those that come will be like this one: they get another network.
-                self.models = replace(self.models, following=None)
             raise _CutError(str(problem)) from problem
         if moved is None and _is_new(result.model, model):
             return Followed(result, "fitted" if last is None else "cut")
