@@ -605,6 +605,19 @@ def test_frames_that_lose_a_feature_follow_again_after_one_full_fit(tmp_path):
     assert how == ["fitted", "followed", "cut", "followed", "followed"]
 
 
+@pytest.mark.parametrize("with_cameras", [True, False])
+def test_frames_that_gain_features_use_them(tmp_path, with_cameras):
+    follower = Follower(replace(DRAFT, iterations=20))
+    how = []
+    for n in range(4):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        buffers = frame.buffers if n >= 2 else frame.buffers.with_quantities(albedo=None, normal=None)
+        followed = follower.denoise(buffers, frame.camera if with_cameras else None)
+        how.append(followed.how)
+        assert ("normal.X" in followed.result.model.layout.features) == (n >= 2)
+    assert how == ["fitted", "followed", "cut", "followed"]
+
+
 def test_flicker_is_not_told_by_halves_that_are_copies(tmp_path):
     follower = Follower(replace(DRAFT, iterations=5))
     for n in range(2):

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from tungsten_dip.buffers.prefilter import prefilter_feature
-from tungsten_dip.buffers.render_buffers import Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, Halves, Quantity, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
@@ -167,6 +167,8 @@ class Follower:
         last = self._last
         if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
             raise _CutError("the previous frame had another size")
+        if last is not None and _features(last.buffers) != _features(buffers):
+            raise _CutError("the previous frame had other features")
         moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
@@ -202,6 +204,10 @@ class Follower:
 
 class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
+
+
+def _features(buffers: RenderBuffers) -> list[Quantity]:
+    return [name for name in FEATURES if buffers.get(name) is not None]
 
 
 def _is_new(network: Model | None, model: Model | None) -> bool:
