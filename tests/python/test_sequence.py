@@ -178,6 +178,21 @@ def test_a_camera_that_stands_still_moves_nothing(tmp_path, lens):
     np.testing.assert_allclose(moved, frame.reference, rtol=1e-3)
 
 
+def test_a_camera_far_from_the_origin_moves_the_same(tmp_path):
+    before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.3))
+
+    def moved(offset):
+        cameras = []
+        for frame in (before, now):
+            world_from_local = np.array(frame.camera.world_from_local, np.float64)
+            world_from_local[:3, 3] += offset
+            cameras.append(replace(frame.camera, world_from_local=world_from_local))
+        truth = before.reference, before.reference
+        return reproject(truth, before.buffers, cameras[0], now.buffers, cameras[1], threads=2)[0]
+
+    np.testing.assert_allclose(moved(1.2e6 + 0.04), moved(0.0), rtol=1e-3)
+
+
 def test_a_scaled_camera_sees_the_same(tmp_path):
     before, now = (true_frame(tmp_path, shift, seed=0) for shift in (0.0, 0.3))
     truth = before.reference, before.reference

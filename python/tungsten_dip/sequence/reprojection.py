@@ -104,8 +104,13 @@ def reproject(
     return moved_a.reshape(shape) * albedo_a, moved_b.reshape(shape) * albedo_b
 
 
-def _points(camera: PerspectiveCamera, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the camera's position, and the way from there to what every pixel shows (length 1 for sky)."""
+_Points = tuple[npt.NDArray[np.float64], FloatArray]
+"""A camera's position, and the way from there to what every pixel shows. Far from the origin, float32 holds
+positions less finely than pixels see, but it holds the differences of two."""
+
+
+def _points(camera: PerspectiveCamera, depth: FloatArray) -> _Points:
+    """Return what every pixel shows; the way there has length 1 for sky."""
     height, width = depth.shape
     frame = np.asarray(camera.world_from_local, np.float64)
     # Tungsten's PinholeCamera::sampleDirection: x from -1 to 1 over the width, the plane at 1 / tan(fov / 2).
@@ -115,11 +120,11 @@ def _points(camera: PerspectiveCamera, depth: FloatArray) -> tuple[FloatArray, F
     ray[:, :, 2] = camera.plane_distance
     ray /= np.sqrt(np.einsum("...i,...i", ray, ray))[:, :, None]
     world = ray @ _rotation(camera).T.astype(np.float32)
-    return frame[:3, 3].astype(np.float32), world * np.where(depth > 0, depth, 1)[:, :, None]
+    return frame[:3, 3], world * np.where(depth > 0, depth, 1)[:, :, None]
 
 
 def _seen_from(
-    camera: PerspectiveCamera, points: tuple[FloatArray, FloatArray], hit: npt.NDArray[np.bool_], part: slice
+    camera: PerspectiveCamera, points: _Points, hit: npt.NDArray[np.bool_], part: slice
 ) -> tuple[FloatArray, ...]:
     """Return where a camera sees points, in pixels (far outside if behind it), and how far from it they are.
 
