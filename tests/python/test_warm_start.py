@@ -82,7 +82,7 @@ def test_a_warm_start_that_only_gets_worse_leaves_the_weights_as_they_were(
     errors = itertools.count(1.0)
     monkeypatch.setattr(training, "held_out_error", lambda *_: next(errors))
     again = denoise(next_frame.buffers, replace(DRAFT, iterations=50), warm_start=model)
-    assert 1 < again.iterations < 50
+    assert again.iterations == 15  # after estimates at 5, 10 and 15
     assert again.model is not None
     for name, value in model.weights.items():
         np.testing.assert_array_equal(again.model.weights[name], value)

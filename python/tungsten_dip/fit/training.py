@@ -180,9 +180,10 @@ class _EarlyStopping:
     weights: Weights
     _since_gain: int = 0
 
-    def record(self, error: float, network: PointwiseNetwork) -> None:
-        """Take note of the error that the network has now."""
-        self._since_gain = 0 if error < (1 - _WARM_GAIN) * self.error else self._since_gain + 1
+    def record(self, step: int, error: float, network: PointwiseNetwork) -> None:
+        """Take note of the error that the network has now. The first step is too small to tell of a gain."""
+        if step > 1:
+            self._since_gain = 0 if error < (1 - _WARM_GAIN) * self.error else self._since_gain + 1
         if error < self.error:
             self.error, self.weights = error, network.weights()
 
@@ -234,7 +235,7 @@ def train(
             done.history.append(HistoryPoint(clock.seconds(), step, error))
             progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
             if stopping is not None:
-                stopping.record(held_out, network)
+                stopping.record(step, held_out, network)
             reason = _reason_to_stop(error, settings, clock, stopping)
             if reason is not None:
                 done.notes.append(f"stopped at step {step}: {reason}")
