@@ -34,7 +34,7 @@ _LEAST_BATCH = 64
 _LEAST_COUNT = 1 << 12
 _BATCH_GROWTH = 4 / 3
 """A step uses `_LEAST_BATCH` pixels where both halves have `_LEAST_COUNT`, and more on larger images, up to
-the number of the preset, which 512x288 pixels reach."""
+the number of the preset, which images of about 512x288 pixels reach."""
 
 _HISTORY_EVERY = 20
 _PROBE_PIXELS = 1 << 15
@@ -47,7 +47,7 @@ _STRANGE = 0.5
 """A model is not used on an image of which more than this part of an input is clipped at `LARGEST_INPUT`."""
 
 _WARM_RATE = 0.3
-"""A network that starts near its goal takes steps this many times as long."""
+"""A network that starts near its goal takes shorter steps: this part of the learning rate."""
 
 _WARM_HISTORY_EVERY = 5
 _WARM_PATIENCE = 3
