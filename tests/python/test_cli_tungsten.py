@@ -1,6 +1,7 @@
 """The command ``tungsten``: what it writes and refuses, and what denoising adds."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -491,6 +492,27 @@ def test_options_may_stand_between_scenes(tmp_path, renders):
     scenes = write_frames(tmp_path, "one", "two")
     assert tungsten.main([str(scenes[0]), "-t", "1", str(scenes[1])]) == 0
     assert (tmp_path / "two.png").exists()
+
+
+def test_what_follows_two_dashes_are_scenes(tmp_path, renders, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_frames(tmp_path, "one", "-x")
+    for arguments in (["--", "-x.json"], ["-t", "1", "one.json", "--", "-x.json"]):
+        assert tungsten.main(arguments) == 0
+        assert (tmp_path / "-x.png").exists()
+        (tmp_path / "-x.png").unlink()
+    assert (tmp_path / "one.png").exists()
+
+
+def test_the_native_command_takes_no_scene_for_an_option(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run_native(arguments):
+        raise InputError(f"run: {arguments}")
+
+    monkeypatch.setattr(tungsten, "_run_native", run_native)
+    with pytest.raises(InputError, match=re.escape(str(["-t", "1", str(tmp_path / "-x.json")]))):
+        tungsten._run(["--host", "tungsten", "-t", "1", "--", "-x.json"])
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,11 @@ def write_outputs(
 def _run(arguments: Sequence[str] | None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser()
-    options = parser.parse_intermixed_args(arguments)
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    options = parser.parse_intermixed_args(arguments[:end])  # which loses the sign that options end
+    options.scenes += map(Path, arguments[end + 1 :])
+    # The native command does not know the sign, but an absolute path is no option to it.
+    arguments[end:] = [str(Path(scene).absolute()) for scene in arguments[end + 1 :]]
     if not options.scenes:
         parser.print_help()
         return
