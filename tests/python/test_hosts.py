@@ -72,6 +72,22 @@ def test_auto_prefers_tungsten_and_says_who_renders(
     assert asked == ([(scene_path, 2)] if has_tungsten else [])
 
 
+def test_a_hook_that_cannot_be_loaded_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(name: str) -> Any:
+        raise ImportError(f"{name}: undefined symbol")
+
+    monkeypatch.setattr(tungsten.importlib, "import_module", fail)
+    tungsten._module.cache_clear()
+    try:
+        for _ in range(2):
+            assert not tungsten.in_process()
+    finally:
+        tungsten._module.cache_clear()
+    assert caplog.text.count("the hook for Tungsten cannot be loaded: tungsten_dip._tungsten: undef") == 1
+
+
 def test_tungsten_reads_the_scene_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "scene.json"
     path.write_text('{"primitives": [{"type": "mesh", "file": "of a fork.abc"}]}')

@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -260,8 +261,9 @@ def _buffers(plan: Any, arrays: _Arrays) -> RenderBuffers:
     return RenderBuffers(**buffers, spp=spp, attributes=attributes)
 
 
+@cache
 def _module() -> Any | None:
-    """The hook: linked into the native command, or importable, or neither."""
+    """The hook: linked into the native command, or importable, or neither. A failure is told once."""
     try:
         return importlib.import_module("tungsten_dip._tungsten")
     except ModuleNotFoundError:
