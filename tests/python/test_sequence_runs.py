@@ -70,6 +70,11 @@ def test_every_frame_is_written_and_told(frames, capfd):
     assert np.isfinite(read_image("out/f0002.exr")).all()
 
 
+def test_one_step_is_told_as_one(frames, capfd):
+    assert main(arguments("--frames", "0", "--target-error", "10")) == 0
+    assert "frame 0: fitted, 1 step, " in capfd.readouterr().err
+
+
 def test_the_page_shows_frames_and_curves(frames):
     assert main(arguments("--report", "page.html", "--frames", "0-2,7")) == 2
     page = (frames / "page.html").read_text()
@@ -229,6 +234,8 @@ def test_bad_options_are_one_line(frames, capsys):
         (("--workers", "1", "--scheduler", "tcp://host:1"), "a scheduler has its own; omit one of the two"),
         (("-o", "out/f####.png"), "ends in .exr"),
         (("--refit", "some"), "expected auto, 0 or a number"),
+        (("--refit", "\N{SUPERSCRIPT TWO}"), "expected auto, 0 or a number"),
+        (("--refit", "-1"), "refit, unless auto: expected a whole number from 0 to"),
         (("--scheduler", "host"), "expected local or an address"),
         (("--frames", "x"), "expected numbers"),
         (("--preset", "paper"), "invalid choice: 'paper'"),

@@ -208,9 +208,10 @@ def _tell(record: Record) -> None:
     elif record.error is not None:
         _LOG.error("frame %d: %s", record.number, record.error)
     else:
+        steps = "step" if record.iterations == 1 else "steps"
         _LOG.info(
-            "frame %d: %s, %d steps, %.1f s: %s",
-            record.number, record.how, record.iterations, record.seconds, record.output,
+            "frame %d: %s, %d %s, %.1f s: %s",
+            record.number, record.how, record.iterations, steps, record.seconds, record.output,
         )  # fmt: skip
 
 
@@ -242,6 +243,7 @@ def _write_report(path: Path, title: str, records: Sequence[Record]) -> None:
 def _refit(text: str) -> int | str:
     if text == "auto":
         return text
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"expected auto, 0 or a number of steps, got '{text}'")
-    return int(text)
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected auto, 0 or a number of steps, got '{text}'") from None
