@@ -32,7 +32,8 @@ _LONGEST_TASK = 24
 """Frames; a task that is done again has to look at all of them."""
 
 _LEADS = 2
-"""Frames that others wait for, where frames follow one another."""
+"""Frames that others wait for, where frames follow one another: the second one's network is for those that
+follow."""
 
 _CONNECT_TIMEOUT_S = 30
 

@@ -23,6 +23,8 @@ _DEPTH_TOLERANCE = 0.02
 """Relative difference of distances up to which two pixels show one surface."""
 
 _NORMAL_TOLERANCE = 0.2
+"""In each component: normals may be 11 to 20 degrees apart, as on a curved surface from pixel to pixel."""
+
 _ALBEDO_TOLERANCE = 0.1
 """Of the larger of 1 and the albedo (a light's is its radiance)."""
 
