@@ -125,6 +125,15 @@ def test_files_are_numbered_where_the_scene_forbids_overwriting(tmp_path, render
     }
 
 
+def test_scenes_that_forbid_overwriting_may_share_a_name(tmp_path, renders):
+    kept = {"overwrite_output_files": False, "output_buffers": []}
+    scenes = [str(write_scene(tmp_path / name, **kept)) for name in ("a.json", "b.json")]
+    assert tungsten.main(["--host", "mitsuba", *scenes]) == 0
+    assert {path.name for path in tmp_path.glob("picture*")} == {
+        f"picture{number}{suffix}" for number in ("", "001") for suffix in (".png", ".exr")
+    }
+
+
 @pytest.mark.parametrize("removed", ["picture.png", "picture.exr", "picture_denoised.exr"])
 def test_the_number_is_free_for_every_picture(removed, tmp_path, renders, fits):
     scene = write_scene(
@@ -180,20 +189,24 @@ def test_scenes_that_would_write_over_one_another_are_refused(second, options, t
     assert len(renders) == 1
 
 
-def test_a_scene_that_failed_has_written_nothing_to_keep(tmp_path, renders, capfd, monkeypatch):
-    render, seen = tungsten.render_with_mitsuba, []
+@pytest.mark.parametrize("wrong", ["names", "content"])
+def test_what_is_wrong_with_a_later_scene_is_told_before_the_first_render(
+    wrong, tmp_path, renders, capfd, monkeypatch
+):
+    render, told = tungsten.render_with_mitsuba, []
 
-    def fails_at_first(scene, **options):
-        seen.append(scene)
-        if len(seen) == 1:
-            raise InputError("a light that there is not")
+    def listed(scene, **options):
+        told.append(capfd.readouterr().err)
         return render(scene, **options)
 
-    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", fails_at_first)
-    scenes = [str(write_scene(tmp_path / name)) for name in ("a.json", "b.json")]
-    assert tungsten.main(["--host", "mitsuba", *scenes]) == 2
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", listed)
+    scenes = [write_scene(tmp_path / name) for name in ("a.json", "b.json")]
+    if wrong == "content":
+        scenes[1].write_text("{")
+    assert tungsten.main(["--host", "mitsuba", *map(str, scenes)]) == 2
+    assert len(told) == 1
+    assert f"{scenes[1]}:" in told[0]
     assert "1 of 2 scenes failed" in capfd.readouterr().err
-    assert len(renders) == 1
 
 
 def test_radiance_that_a_hdr_does_not_hold_is_clipped_and_loses_no_render(tmp_path, caplog):
@@ -290,9 +303,11 @@ def test_images_that_would_be_written_over_one_another_are_refused(
 
 @pytest.mark.parametrize("name", ["a\0b", "a\ud800"])
 @pytest.mark.parametrize("field", ["output_file", "hdr_output_file", "output_directory"])
-def test_names_that_no_file_can_have_are_one_line(field, name, tmp_path, renders, capfd):
+@pytest.mark.parametrize("overwrite", [True, False])
+def test_names_that_no_file_can_have_are_one_line(field, overwrite, name, tmp_path, renders, capfd):
     suffix = {"output_file": ".png", "hdr_output_file": ".exr", "output_directory": ""}[field]
-    scene = write_scene(tmp_path / "scene.json", **{field: name + suffix})
+    names = {field: name + suffix, "overwrite_output_files": overwrite}
+    scene = write_scene(tmp_path / "scene.json", **names)
     fails(capfd, tungsten.main([str(scene)]), "expected a name that a file can have")
     assert renders == []
 

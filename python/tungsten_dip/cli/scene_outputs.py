@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -62,8 +62,10 @@ class SceneOutputs:
         """Return the path of the picture that is denoised before the render is done."""
         return self.beside("_preview.png")
 
-    def numbered(self, denoise: bool) -> SceneOutputs:
-        """Return the outputs with the first number (none, 001, 002, ...) under which no picture exists.
+    def numbered(self, denoise: bool, taken: Collection[Path]) -> SceneOutputs:
+        """Return the outputs with the first number (none, 001, 002, ...) whose pictures do not exist.
+
+        They are not ``taken`` either, of which the paths are resolved.
 
         As with Tungsten, buffers get no number. Numbers of Tungsten's may differ between the two pictures.
         """
@@ -71,7 +73,7 @@ class SceneOutputs:
             ldr, hdr = (_numbered(path, index) for path in (self.ldr, self.hdr))
             outputs = replace(self, ldr=ldr, hdr=hdr)
             pictures = [*filter(None, (ldr, hdr)), *(outputs.denoised() if denoise else ())]
-            if not any(path.exists() for path in pictures):
+            if not any(path.exists() or path.resolve() in taken for path in pictures):
                 break
         return outputs
 

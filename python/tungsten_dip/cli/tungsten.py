@@ -6,10 +6,10 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NoReturn, get_args
+from typing import Literal, NoReturn, TypeVar, get_args
 
 import tungsten_dip
 from tungsten_dip.buffers.atomic import check_writable, write_text
@@ -51,6 +51,18 @@ _PREVIEW_INTERVAL_S = 60.0
 
 Denoise = Callable[[Camera, RenderBuffers], FitResult]
 """Denoises the render of a camera."""
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A scene to render, its files, and the options with its own seed."""
+
+    scene: Scene
+    outputs: SceneOutputs
+    options: argparse.Namespace
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -136,19 +148,36 @@ def _run(arguments: Sequence[str] | None) -> None:
             seeds = [options.seed, *((first + index) % 2**32 for index in range(1, len(seeds)))]
         else:
             denoise = _each_alone(settings, warm_start)
-    failed = 0
-    written: set[Path] = set()
-    for path, seed in zip(options.scenes, seeds, strict=True):
+    count = len(options.scenes)
+    taken: set[Path] = set()
+
+    def check(path_and_seed: tuple[Path, int | None]) -> _Job:
+        path, seed = path_and_seed
         of_scene = argparse.Namespace(**{**vars(options), "seed": seed})
+        scene = load_scene(path, options.input_directory)
+        return _Job(scene, _checked_outputs(scene, of_scene, taken), of_scene)
+
+    # All of them first: what is wrong with the last one is not to be told after hours of rendering.
+    jobs = _succeeded(check, zip(options.scenes, seeds, strict=True), count == 1)
+    done = _succeeded(lambda job: _render_scene(job, host, settings, denoise), jobs, count == 1)
+    if len(done) < count:
+        raise InputError(f"{count - len(done)} of {count} scenes failed, see above")
+
+
+def _succeeded(action: Callable[[_T], _R], items: Iterable[_T], alone: bool) -> list[_R]:
+    """Return what becomes of the items but for those that raise InputError, which is logged.
+
+    Raises it instead if the item is ``alone``.
+    """
+    results = []
+    for item in items:
         try:
-            _render_scene(path, host, of_scene, settings, denoise, written)
+            results.append(action(item))
         except InputError as error:
-            if len(options.scenes) == 1:
+            if alone:
                 raise
-            failed += 1
             _LOG.error("%s", error)
-    if failed:
-        raise InputError(f"{failed} of {len(options.scenes)} scenes failed, see above")
+    return results
 
 
 def _run_native(arguments: Sequence[str]) -> NoReturn:
@@ -219,30 +248,19 @@ def _stock_arguments(arguments: Sequence[str]) -> list[str]:
     return stock
 
 
-def _render_scene(
-    path: Path,
-    host: str,
-    options: argparse.Namespace,
-    settings: FitSettings,
-    denoise: Denoise | None,
-    written: set[Path],
-) -> None:
+def _render_scene(job: _Job, host: str, settings: FitSettings, denoise: Denoise | None) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
 
-    ``written`` are the files of the scenes before, to which this one's are added.
-
-    Raises InputError if the scene would write over one of those, or as whatever is called here does.
+    Raises InputError as whatever is called here does.
     """
-    scene = load_scene(path, options.input_directory)
-    outputs, files = _checked_outputs(scene, options, written)
+    scene, outputs, options = job.scene, job.outputs, job.options
     with remarks_from_log() as remarks:
-        with progress_on_stderr(f"rendering {path.name}") as progress:
+        with progress_on_stderr(f"rendering {scene.path.name}") as progress:
             if host == "tungsten":
                 buffers, unwritten = _render_with_tungsten(scene, outputs, options, settings, progress)
             else:
                 buffers, unwritten = _render_with_mitsuba(scene, options, progress), outputs
         write_render(buffers, unwritten, scene.camera.tonemap)
-        written |= files
         for picture in filter(None, (outputs.ldr, outputs.hdr)):
             _LOG.info("wrote %s", picture)
         if denoise is not None:
@@ -251,12 +269,13 @@ def _render_scene(
             write_outputs(result, buffers, outputs, tonemap, options.report, remarks, options.save_model)
 
 
-def _checked_outputs(
-    scene: Scene, options: argparse.Namespace, written: set[Path]
-) -> tuple[SceneOutputs, set[Path]]:
-    """Return what a scene writes, and all its files, with what is made of the render.
+def _checked_outputs(scene: Scene, options: argparse.Namespace, taken: set[Path]) -> SceneOutputs:
+    """Return what a scene writes.
 
-    They can be written, over no input and over no file of the scenes before.
+    ``taken`` are the files of the scenes before, to which this one's are added, with what is made of the
+    render.
+
+    Raises InputError if a file cannot be written, or would be written over an input or one that is taken.
     """
     if options.output_directory is not None:
         options.output_directory.mkdir(parents=True, exist_ok=True)
@@ -268,9 +287,10 @@ def _checked_outputs(
     )
     if options.dip_denoise:
         outputs = outputs.with_both_pictures()
-    if not scene.renderer.overwrite_output_files:
-        outputs = outputs.numbered(options.dip_denoise)
     outputs.check()
+    if not scene.renderer.overwrite_output_files:
+        outputs = outputs.numbered(options.dip_denoise, taken)
+        outputs.check()
     own = list(outputs.denoised()) if options.dip_denoise else []
     if options.dip_preview:
         own.append(outputs.preview())
@@ -281,7 +301,7 @@ def _checked_outputs(
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")
-    overwritten = written & (rendered | derived)
+    overwritten = taken & (rendered | derived)
     if overwritten:
         raise InputError(
             f"{scene.path}: would write over {min(overwritten)}, which belongs to a scene before; give every "
@@ -291,7 +311,8 @@ def _checked_outputs(
         check_writable(options.report, ".html")
     if options.save_model is not None:
         check_writable(options.save_model, ".onnx")
-    return outputs, rendered | derived
+    taken |= rendered | derived
+    return outputs
 
 
 def _render_with_tungsten(
