@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from conftest import SyntheticRender
+from conftest import MakeRender, SyntheticRender
 from fitted_models import DRAFT, check_result
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
-from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import denoise
+from tungsten_dip.fit.preparation import prepared
 
 
 @pytest.mark.parametrize("spoil", ["sums", "another picture", "little of another layer"])
@@ -86,3 +87,75 @@ def test_halves_of_unequal_size_are_used(render: SyntheticRender) -> None:
     mean = (2 * color.half_a + color.half_b) / 3
     buffers = render.buffers.with_quantities(color=Buffer(mean, color.half_a, color.half_b))
     assert not denoise(buffers, DRAFT).halves_drawn
+
+
+@pytest.mark.parametrize(
+    ("lost", "left", "skipped"),
+    [(np.nan, "half_a", False), (np.inf, "half_b", False), (3e36, "half_b", False), (np.nan, "half_b", True)],
+)
+def test_noise_that_one_half_alone_shows_is_not_taken_for_detail(
+    lost: float, left: str, skipped: bool, make_render: MakeRender
+) -> None:
+    """``skipped``: the renderer left out of the mean what it could not compute."""
+    render = make_render(96, 96)
+    block = np.s_[20:80, 20:80]
+    planes = {name: plane.copy() for name, plane in render.buffers.color.planes()}
+    for name, plane in planes.items():
+        if name != left:
+            plane[block] = lost / 2 if name == "mean" else lost
+    if skipped:
+        planes["mean"][block] = planes[left][block]
+    buffers = render.buffers.with_quantities(color=Buffer(**planes))
+    result = denoise(buffers, DRAFT)
+    check_result(result, buffers)
+    assert not result.halves_drawn
+    assert any("one half of the samples is lost in 3600 of 9216 pixels" in note for note in result.notes)
+
+    def relmse(image: FloatImage) -> float:
+        truth = render.reference[block]
+        return float(np.mean((image[block] - truth) ** 2 / (truth**2 + 0.01)))
+
+    error = relmse(result.color)
+    assert error < 2.5 * relmse(denoise(render.buffers, DRAFT).color)
+    assert result.error is not None
+    assert result.error[block].mean() > error / 2
+
+
+def test_lamps_beside_what_one_half_lost_stay_in_both_halves(render: SyntheticRender) -> None:
+    color, albedo = render.buffers.color, render.buffers.albedo
+    assert albedo is not None
+    changed = {}
+    for quantity, buffer in (("color", color), ("albedo", albedo)):
+        planes = {name: plane.copy() for name, plane in buffer.planes()}
+        for plane in planes.values():
+            plane[4:12, 4:12] = 9
+        changed[quantity] = Buffer(**planes)
+    lamp = changed["color"]
+    lamp.mean[20:30, 20:40] = lamp.half_a[20:30, 20:40] = np.nan
+    known = prepared(render.buffers.with_quantities(**changed), 1).buffers
+    assert known.color.halves is not None
+    whole = np.ones(color.mean.shape[:2], bool)
+    whole[20:30, 20:40] = False
+    for half, before in zip(known.color.halves, changed["color"].halves, strict=True):
+        np.testing.assert_array_equal(half[whole], before[whole])
+    np.testing.assert_allclose(sum(known.color.halves)[~whole] / 2, lamp.half_b[~whole], rtol=1e-5)
+
+
+def test_an_image_of_one_half_alone_is_one_without_halves(render: SyntheticRender) -> None:
+    color = render.buffers.color
+    assert color.half_b is not None
+    nothing = np.full_like(color.mean, np.nan)
+    alone = render.buffers.with_quantities(color=Buffer(nothing, nothing, color.half_b, nothing))
+    result = denoise(alone, DRAFT)
+    check_result(result, alone)
+    assert "one half of the samples is lost in every pixel" in result.notes
+    assert result.halves_drawn
+    single = render.buffers.with_quantities(color=Buffer(np.maximum(color.half_b, 0)))
+    np.testing.assert_array_equal(result.color, denoise(single, DRAFT).color)
+
+
+def test_halves_that_are_both_lost_do_not_agree(render: SyntheticRender) -> None:
+    nothing = np.full_like(render.buffers.color.mean, np.nan)
+    color = Buffer(nothing, nothing, nothing, nothing)
+    result = denoise(render.buffers.with_quantities(color=color), DRAFT)
+    assert "the image is black: the image is returned as it is" in result.notes

@@ -27,7 +27,7 @@ _CONVERGED = 1e-5
 def result_without_noise(
     buffers: RenderBuffers, settings: FitSettings, clock: Clock, progress: Progress
 ) -> FitResult | None:
-    """Return the image as it is if its halves hardly differ, else None.
+    """Return the image as it is if its halves hardly differ or it is black, else None.
 
     Copies do not differ at all: they count as free of noise only if the variance confirms it.
     """
@@ -43,6 +43,7 @@ def result_without_noise(
     if max(estimated) >= _CONVERGED or estimated == [0]:
         return None
     progress(1.0, "no noise")
+    why = "the halves agree to within a few thousandths" if squared.any() else "the image is black"
     error = channel_mean(bounded_ratio(noise, squared + RELMSE_EPSILON).astype(np.float32))
     return FitResult(
         color=color.mean.copy(),
@@ -52,7 +53,7 @@ def result_without_noise(
         error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
         estimated_relmse=float(error.mean(dtype=np.float64)),
         halves=color.halves,
-        notes=("the halves agree to within a few thousandths: the image is returned as it is",),
+        notes=(f"{why}: the image is returned as it is",),
     )
 
 

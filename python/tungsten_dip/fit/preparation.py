@@ -6,14 +6,19 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
-from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.result import FitResult
+from tungsten_dip.fit.splitting import with_lost_halves_drawn
 
 _LOG = logging.getLogger(__name__)
+
+_INFINITE_RADIANCE = np.float32(1e36)
+"""From which on radiance counts as infinite, as in `sanitize`."""
 
 _LARGEST_ALBEDO = 2.0
 """Of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far above."""
@@ -34,7 +39,7 @@ class Prepared:
 
 
 def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
-    """Check and sanitise the input; an albedo in another scale is left out.
+    """Check and sanitise the input; an albedo in another scale is left out, lost halves are drawn.
 
     Raises InputError if these are no buffers or the image is empty.
     """
@@ -46,9 +51,52 @@ def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
             "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
     buffers, foreign = without_foreign_halves(buffers)
+    rendered = buffers.color
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
-    return Prepared(buffers, (*foreign, *repaired))
+    buffers, lost = _without_lost_halves(buffers, rendered, threads)
+    return Prepared(buffers, (*foreign, *repaired, *lost))
+
+
+def _without_lost_halves(
+    buffers: RenderBuffers, rendered: Buffer, threads: int | None
+) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return sanitised buffers with halves drawn where one half alone is left, and a note if there are any.
+
+    ``rendered`` is the colour before it was sanitised. A copy of the half that is left would confirm all of
+    its noise, and neighbouring pixels have less noise than it. Lamps, which are equal in both halves, stay as
+    they are: nothing of them is lost.
+    """
+    color = buffers.color
+    if color is rendered or rendered.halves is None or color.halves is None:
+        return buffers, ()
+    known, known_a, known_b = (_finite(image) for image in (rendered.mean, *rendered.halves))
+    # A renderer may also have left out of the mean what it could not compute.
+    alone_a, alone_b = (
+        ~known | (rendered.mean == half).all(axis=2, keepdims=True) for half in rendered.halves
+    )
+    only_a, only_b = known_a & ~known_b & alone_a, known_b & ~known_a & alone_b
+    lost = only_a | only_b
+    count = np.count_nonzero(lost)
+    if count == 0:
+        return buffers, ()
+    half_a, half_b = color.halves
+    mean = np.where(only_a, half_a, np.where(only_b, half_b, color.mean))
+    if count == lost.size:
+        note = "one half of the samples is lost in every pixel"
+        return buffers.with_quantities(color=Buffer(mean)), (note,)
+    buffers = buffers.with_quantities(color=replace(color, mean=mean))
+    note = (
+        f"one half of the samples is lost in {count} of {lost.size} pixels: the noise of the other half, "
+        "estimated from the surrounding pixels, is split at random into two"
+    )
+    return with_lost_halves_drawn(buffers, lost, threads), (note,)
+
+
+def _finite(image: FloatImage) -> npt.NDArray[np.bool_]:
+    """Return in which pixels every channel is known, shape (height, width, 1)."""
+    known: npt.NDArray[np.bool_] = np.abs(image).max(axis=2, keepdims=True) < _INFINITE_RADIANCE
+    return known
 
 
 def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:

@@ -10,7 +10,7 @@ needs.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -76,23 +76,53 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int | No
     untestable = color.halves is not None and np.isnan(test.correlation) and not np.array_equal(*color.halves)
     if test.independent or untestable:
         return HalvedImage(buffers)
-    emitted = np.zeros_like(color.mean)
-    if buffers.albedo is not None:
-        emitted = np.maximum(buffers.albedo.mean - 1, 0)
-    share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
     note = (
         f"{_why(buffers, test)}: its noise, estimated from the surrounding pixels, is split at random into "
         f"two; the estimated error may be too low"
     )
-    split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
+    return HalvedImage(_with_drawn_halves(buffers, seed, threads), drawn=True, notes=(note,))
+
+
+def with_lost_halves_drawn(
+    buffers: RenderBuffers, lost: npt.NDArray[np.bool_], threads: int | None
+) -> RenderBuffers:
+    """Return sanitised buffers with halves, drawn where ``lost``, from a mean that is the half left there.
+
+    ``lost`` has shape (height, width, 1). The halves elsewhere stay as they are. The variance of the colour
+    becomes what the halves drawn show. The same image gives the same halves.
+    """
+    drawn = _with_drawn_halves(buffers, 0, threads)
+
+    def merged(before: Buffer, after: Buffer) -> Buffer:
+        pairs = zip(before.halves_or_mean, after.halves_or_mean, strict=True)
+        half_a, half_b = (np.where(lost, split, half) for half, split in pairs)
+        return Buffer(before.mean, half_a, half_b, after.variance)
+
+    color = merged(buffers.color, drawn.color)
+    if color.variance is not None:
+        a, b = color.halves_or_mean
+        with np.errstate(over="ignore"):
+            squared = np.minimum((a - b) ** 2 / 4, np.finfo(np.float32).max)
+        color = replace(color, variance=np.where(lost, squared, color.variance))
     albedo = buffers.albedo
+    if albedo is not None and drawn.albedo is not None and drawn.albedo is not albedo:
+        albedo = merged(albedo, drawn.albedo)
+    return buffers.with_quantities(color=color, albedo=albedo)
+
+
+def _with_drawn_halves(buffers: RenderBuffers, seed: int, threads: int | None) -> RenderBuffers:
+    """Return buffers with halves drawn from the mean, also of the light that the albedo contains."""
+    color, albedo = buffers.color, buffers.albedo
+    emitted = np.zeros_like(color.mean) if albedo is None else np.maximum(albedo.mean - 1, 0)
+    share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
+    split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
     if albedo is not None and emitted.any():
         # The colour contains the emitted light, too, and with the same noise.
         surfaces = (np.minimum(half, 1) for half in albedo.halves_or_mean)
         half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
         variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
         split["albedo"] = Buffer(albedo.mean, half_a, half_b, variance)
-    return HalvedImage(buffers.with_quantities(**split), drawn=True, notes=(note,))
+    return buffers.with_quantities(**split)
 
 
 def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads: int) -> FloatImage:
