@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -159,3 +161,30 @@ def test_halves_that_are_both_lost_do_not_agree(render: SyntheticRender) -> None
     color = Buffer(nothing, nothing, nothing, nothing)
     result = denoise(render.buffers.with_quantities(color=color), DRAFT)
     assert "the image is black: the image is returned as it is" in result.notes
+
+
+@pytest.mark.parametrize("missing", ["half_a", "half_b"])
+@pytest.mark.parametrize("quantity", ["color", "albedo", "normal", "depth"])
+def test_a_missing_half_is_what_the_mean_and_the_other_half_imply(
+    missing: str, quantity: str, render: SyntheticRender
+) -> None:
+    buffer = getattr(render.buffers, quantity)
+    if quantity != "normal":
+        half_a, half_b = (np.maximum(half, 0) for half in buffer.halves)
+        buffer = Buffer((half_a + half_b) / 2, half_a, half_b, buffer.variance)
+    single = render.buffers.with_quantities(**{quantity: replace(buffer, **{missing: None})})
+    known = prepared(single, 1)
+    assert any(f"{quantity}: half {missing[-1].upper()} is missing" in note for note in known.notes)
+    completed = getattr(known.buffers, quantity)
+    np.testing.assert_allclose(getattr(completed, missing), getattr(buffer, missing), atol=1e-5)
+    assert (quantity == "normal") == (completed.half_a.min() < 0)
+    assert completed.variance is buffer.variance
+
+
+def test_a_missing_half_is_never_negative() -> None:
+    mean = np.full((4, 6, 3), 1, np.float32)
+    color = Buffer(mean, np.full_like(mean, 2.001))
+    known = prepared(RenderBuffers(color), 1)
+    assert known.buffers.color.half_b is not None
+    assert (known.buffers.color.half_b == 0).all()
+    assert not any("negative" in note for note in known.notes)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
-from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-__all__ = ["HalvesTest", "compare_halves", "without_foreign_halves"]
+__all__ = ["HalvesTest", "compare_halves", "with_both_halves", "without_foreign_halves"]
 
 _UNEQUAL = 0.5
 """How far a pixel may lie from (A + B) / 2, over |A - B| / 2. Halves of one and of two samples give 1/3."""
@@ -40,6 +42,29 @@ def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> Halves
     if color.halves is None:
         return HalvesTest()
     return _core.compare_halves(*color.halves, color.variance, thread_count(threads))
+
+
+def with_both_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return buffers with the other half of what has one half alone, and a line for each quantity.
+
+    Half B is 2 times the mean minus half A, and never negative, except for normals.
+    """
+    completed: dict[str, Buffer | None] = {}
+    lines = []
+    for name in ("color", *FEATURES):
+        buffer = buffers.get(name)
+        if buffer is None or buffer.halves is not None:
+            continue
+        missing, half = ("A", buffer.half_b) if buffer.half_a is None else ("B", buffer.half_a)
+        if half is None:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            other = 2 * buffer.mean - half
+        if name != "normal":
+            np.maximum(other, 0, out=other)  # where rounding made it negative
+        completed[name] = replace(buffer, **{f"half_{missing.lower()}": other})
+        lines.append(f"{name}: half {missing} is missing, and is computed from the mean and the other half")
+    return buffers.with_quantities(**completed), tuple(lines)
 
 
 def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.half_buffers import without_foreign_halves
+from tungsten_dip.buffers.half_buffers import with_both_halves, without_foreign_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
@@ -39,7 +39,7 @@ class Prepared:
 
 
 def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
-    """Check and sanitise the input; an albedo in another scale is left out, lost halves are drawn.
+    """Check and sanitise the input, without an albedo in another scale, with halves for those that are lost.
 
     Raises InputError if these are no buffers or the image is empty.
     """
@@ -50,12 +50,13 @@ def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
         _LOG.warning(
             "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
+    buffers, single = with_both_halves(buffers)
     buffers, foreign = without_foreign_halves(buffers)
     rendered = buffers.color
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
     buffers, lost = _without_lost_halves(buffers, rendered, threads)
-    return Prepared(buffers, (*foreign, *repaired, *lost))
+    return Prepared(buffers, (*single, *foreign, *repaired, *lost))
 
 
 def _without_lost_halves(
