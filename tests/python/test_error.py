@@ -8,7 +8,7 @@ import pytest
 from conftest import SyntheticRender
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, Halves
 from tungsten_dip.fit import FitSettings, denoise
-from tungsten_dip.fit.error import estimate_error, held_out_error
+from tungsten_dip.fit.error import crossed_errors, estimate_error, held_out_error
 
 PIXELS = 10_000
 TRUTH = 1.0
@@ -62,6 +62,19 @@ def test_the_held_out_error_is_told_by_the_halves_or_where_they_are_too_noisy_by
     smallest = _constant(TRUTH) if sigma > 1 else _constant(TRUTH + 5)
     error = held_out_error([_noisy(sigma, seed=4), smallest], _constant(TRUTH + bias))
     assert error == pytest.approx(bias**2 / ((TRUTH + bias) ** 2 + 0.01), rel=0.05)
+
+
+def test_the_error_is_that_of_the_other_half_also_beside_bright_noise() -> None:
+    """((f_a - b)^2 + (f_b - a)^2 - (a - b)^2) / 2, whose large squares would cancel in float32."""
+    rng = np.random.default_rng(6)
+    noisy = _noisy(1, seed=7)
+    noisy[0][::2] = 1e6 * rng.random((PIXELS // 2, 3), np.float32)
+    fused = _noisy(0.1, seed=8)
+    of_one, variance = crossed_errors(noisy, fused)
+    a, b, fused_a, fused_b = (image.astype(np.float64) for image in (*noisy, *fused))
+    exact = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2
+    np.testing.assert_allclose(of_one, exact, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(variance, (fused_a - fused_b) ** 2 / 4, rtol=1e-5, atol=1e-6)
 
 
 def test_an_input_as_good_as_what_is_fitted_to_it_is_returned(render: SyntheticRender) -> None:

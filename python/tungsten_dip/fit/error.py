@@ -90,18 +90,16 @@ def error_from_halves(targets: Halves, fused: Halves, epsilon: np.float32) -> tu
 def crossed_errors(noisy: Halves, fused: Halves) -> tuple[FloatArray, FloatArray]:
     """Return the squared error of one half's result in the mean, and the variance of the mean of both.
 
-    ``noisy`` are independent images a, b of the truth r, and ``fused`` the results f_a, f_b of one of them
-    each. Then f_a is independent of the noise of b, and
-
-        E (f_a - b)^2 = E (f_a - r)^2 + Var b,      E (a - b)^2 = Var a + Var b,
-
-    so that ((f_a - b)^2 + (f_b - a)^2 - (a - b)^2) / 2 is in the mean the squared error of one result. Of
-    f = (f_a + f_b) / 2 it is less by (f_a - f_b)^2 / 4, the variance of f, since
-    ((x + y) / 2)^2 = (x^2 + y^2) / 2 - ((x - y) / 2)^2 holds for any x and y.
+    ``noisy`` are independent images a, b of the truth, and ``fused`` the results f_a, f_b of one of them
+    each. The residuals f_a - a and f_b - b are independent, and the mean of each is the bias of a result, so
+    that the mean of their product is the squared bias. (f_a - f_b)^2 / 2 is in the mean the variance of one
+    result, and half of it that of (f_a + f_b) / 2. Where float32 overflows, both errors are infinite, or the
+    first is NaN.
     """
     (a, b), (fused_a, fused_b) = noisy, fused
-    of_one = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2
-    variance: FloatArray = (fused_a - fused_b) ** 2 / np.float32(4)
+    with np.errstate(over="ignore", invalid="ignore"):
+        variance: FloatArray = (fused_a - fused_b) ** 2 / np.float32(4)
+        of_one = (fused_a - a) * (fused_b - b) + 2 * variance
     return of_one, variance
 
 
