@@ -272,6 +272,15 @@ def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:
     assert error_of_one < 0.1 * float(np.mean((albedo.mean - 0.5) ** 2))
 
 
+def test_of_a_feature_without_halves_no_remaining_noise_is_claimed() -> None:
+    noisy = np.random.default_rng(8).normal(0.5, 0.05, (30, 40, 3)).astype(np.float32)
+    filtered = prefilter_features(RenderBuffers(Buffer(noisy), albedo=Buffer(noisy))).albedo
+    assert filtered is not None
+    assert filtered.variance is None
+    assert filtered.halves is None
+    assert filtered.mean.std() < 0.7 * noisy.std()
+
+
 def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
     buffers = make_render(height=71, width=133).buffers
     one, many = prefilter_features(buffers, threads=1), prefilter_features(buffers, threads=5)

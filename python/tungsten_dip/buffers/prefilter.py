@@ -37,13 +37,14 @@ def prefilter_feature(
     As in Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo
     Renderings", section 5.1. The variance of the result is that of the noise which remains in it. Values
     whose pixel and those next to it have noise of less than a thousandth pass through to the bit. A feature
-    without halves is filtered with weights of its own, by the noise estimated from its second differences.
-    ``signed`` values, such as normals, may be negative; they are not normalised again. ``passes`` are radius,
-    step and standard deviations of each.
+    without halves is filtered once, with weights of its own, by the noise estimated from its second
+    differences; how much noise remains is then unknown, and so is the variance of the result. ``signed``
+    values, such as normals, may be negative; they are not normalised again. ``passes`` are radius, step and
+    standard deviations of each.
     """
     mean, (half_a, half_b), variance = feature.mean, feature.halves_or_mean, feature.variance
     if feature.halves is None:
-        variance = noise_in(mean, threads)
+        passes, variance = passes[:1], noise_in(mean, threads)
     for radius, step, k in passes:
         mean, half_a, half_b, variance = _core.prefilter_feature(
             mean, half_a, half_b, variance, radius=radius, step=step, k=k, threads=threads
@@ -51,9 +52,7 @@ def prefilter_feature(
     if not signed:
         # Where negative values were repaired, the mean is not that of the halves and may be negative.
         np.maximum(mean, 0, out=mean)
-    if feature.halves is None:
-        return Buffer(mean, variance=variance)
-    return Buffer(mean, half_a, half_b, variance)
+    return Buffer(mean) if feature.halves is None else Buffer(mean, half_a, half_b, variance)
 
 
 def noise_in(image: FloatImage, threads: int) -> FloatImage:
