@@ -207,6 +207,17 @@ def test_an_impossible_number_of_samples_is_ignored(tmp_path: Path, count: float
     assert read_buffers(tmp_path / "a.exr").spp is None
 
 
+def test_a_layer_of_impossible_numbers_of_samples_is_ignored(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    channels = {name: pixels(index) for index, name in enumerate([*"RGB", "spp"])}
+    channels["spp"][1, 2] = np.nan
+    save_channels(tmp_path / "a.exr", channels)
+    assert read_buffers(tmp_path / "a.exr").spp is None
+    assert "ignored: spp, because" in caplog.text
+
+
 def test_variance_of_unknown_scale_is_taken_only_when_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

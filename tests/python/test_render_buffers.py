@@ -146,3 +146,13 @@ def test_samples_per_pixel_that_are_no_such_number_are_refused(spp):
 
 def test_what_is_asked_for_helps():
     assert RenderBuffers(Buffer(GREY, unaligned().copy(), np.asfortranarray(GREY).copy())).width == 5
+
+
+@pytest.mark.parametrize("spp", [-1.0, float("nan"), float("inf"), 2.0**32])
+def test_impossible_numbers_of_samples_in_a_pixel_are_refused(spp):
+    counts = of_shape(4, 5, 1)
+    counts[1, 2] = 0
+    assert RenderBuffers(Buffer(GREY), spp=counts).spp is counts
+    counts[1, 2] = spp
+    with pytest.raises(InputError, match=r"^spp: expected numbers from 0 to"):
+        RenderBuffers(Buffer(GREY), spp=counts)

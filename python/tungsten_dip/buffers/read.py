@@ -26,7 +26,14 @@ from tungsten_dip.buffers.layers import (
     mapped_channels,
     names_quantity,
 )
-from tungsten_dip.buffers.render_buffers import CHANNELS, MOST_SPP, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import (
+    CHANNELS,
+    MOST_SPP,
+    Buffer,
+    FloatImage,
+    RenderBuffers,
+    are_counts,
+)
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.buffers.tungsten_files import files_of_folder, files_of_scene
 from tungsten_dip.errors import InputError
@@ -227,6 +234,9 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     spp = float(spp) if isinstance(spp, (int, float)) and 0 < spp <= MOST_SPP else None
     if "colorVariance" not in source.mapping:
         _settle_variance(groups, planes, spp)
+    if "spp" in planes and not are_counts(planes["spp"]):
+        del planes["spp"]
+        _LOG.info("ignored: %s, because some values are no numbers of samples", _shown(groups["spp"]))
     buffers: dict[str, Any] = {"spp": planes.get("spp", spp)}
     _LOG.info("%s: %d x %d pixels", path, main.window[2], main.window[3])
     for quantity in CHANNELS:

@@ -90,13 +90,14 @@ class Buffer:
 class RenderBuffers:
     """Everything a renderer outputs for one image.
 
-    ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies.
+    ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies (0 in
+    pixels without a sample).
     ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
     output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
     (None for buffers that are not, or no longer, those of a file).
 
     Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, an
-    array is not C-contiguous float32, or ``spp`` is neither an array nor a number above 0.
+    array is not C-contiguous float32, or ``spp`` is neither a number above 0 nor an array of such and 0.
     """
 
     color: Buffer
@@ -127,6 +128,8 @@ class RenderBuffers:
         for name, more in (("alpha", self.alpha), ("spp", self.spp)):
             if isinstance(more, np.ndarray):
                 _check(name, more, size, 1)
+        if isinstance(self.spp, np.ndarray) and not are_counts(self.spp):
+            raise InputError(f"spp: expected numbers from 0 to {MOST_SPP} alone; use None if it is not known")
         if self.source and any(
             _differs(getattr(self, name), self.source.read.get(name)) for name in (*CHANNELS, "alpha", "spp")
         ):
@@ -183,6 +186,11 @@ def check_array(what: str, array: Any, remedy: str = _AS_ARRAY) -> None:
         raise InputError(f"{what}: expected an array without a mask, got MaskedArray; use .filled(0)")
     if array.dtype.kind not in "biuf":
         raise InputError(f"{what}: expected real numbers, got {array.dtype}; {remedy}")
+
+
+def are_counts(spp: FloatImage) -> bool:
+    """Whether every pixel's number of samples is possible; 0 is."""
+    return bool(((spp >= 0) & (spp <= MOST_SPP)).all())
 
 
 def as_float32(what: str, array: npt.NDArray[Any]) -> FloatImage:
