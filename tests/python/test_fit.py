@@ -123,6 +123,16 @@ def test_any_exposure_is_denoised_without_overflow(exponent: int, render: Synthe
     assert kept == pytest.approx(given, rel=0.1)
 
 
+@pytest.mark.parametrize("exponent", [-118, -130])
+def test_images_near_the_smallest_numbers_are_denoised(exponent: int, render: SyntheticRender) -> None:
+    dark = [np.ldexp(image, exponent) for image in (render.buffers.color.mean, *render.buffers.color.halves)]
+    result = denoise(render.buffers.with_quantities(color=Buffer(*dark)), _settings())
+    noisy, denoised = (
+        np.mean((np.ldexp(image, -exponent) - render.reference) ** 2) for image in (dark[0], result.color)
+    )
+    assert denoised < 0.2 * noisy
+
+
 def test_dark_images_are_not_taken_for_clean_ones(render: SyntheticRender) -> None:
     """Without halves to trust, the exposure changes nothing either."""
     color, scale = render.buffers.color, np.float32(2.0**-21)

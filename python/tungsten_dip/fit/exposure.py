@@ -19,7 +19,8 @@ def exposure(color: FloatImage) -> float:
     lit = level[level > 0]
     if lit.size == 0:
         return 1.0
-    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -100, 100))
+    # Powers that float32 can hold.
+    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -126, 126))
 
 
 def scaled(image: FloatImage, scale: float) -> FloatImage:
