@@ -3,12 +3,14 @@
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from conftest import SyntheticRender
 from tungsten_dip.buffers.write import write_tungsten_folder
+from tungsten_dip.fit import FitResult
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -27,6 +29,13 @@ def test_the_examples_of_a_page_are_a_program(page: str, render: SyntheticRender
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "kitchen.exr").is_file()
+
+
+def test_every_field_of_a_result_is_documented() -> None:
+    page = (ROOT / "docs" / "python.md").read_text()
+    table = page.partition("The fields of `result`")[2].partition("\n## ")[0]
+    documented = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+    assert documented == [field.name for field in fields(FitResult)]
 
 
 def anchors(page: Path) -> set[str]:

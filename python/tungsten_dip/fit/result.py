@@ -22,11 +22,12 @@ class HistoryPoint:
 class FitResult:
     """A denoised image, its estimated error, and the fitted network.
 
-    ``color`` is linear radiance, float32, shape (height, width, 3). ``estimated_relmse`` is its estimated
-    relMSE (with epsilon 0.01), and ``error`` the estimated relative squared error around every pixel, shape
-    (height, width, 1), the mean over 9x9 pixels. ``halves`` are the results of half A of the samples alone
-    and of half B alone, in the units and shape of ``color``, which is their mean with the preset draft, and
-    with the others moved from it towards the pilots of all samples. These are None with the preset paper.
+    ``color`` is linear radiance, float32, shape (height, width, 3). ``halves`` are the results of half A of
+    the samples alone and of half B alone, in the units and shape of ``color``, which is their mean with the
+    preset draft, and with the others moved from it towards the pilots of all samples. ``estimated_relmse`` is
+    the estimated relMSE (with epsilon 0.01) of the mean of ``halves``, before that move, and ``error`` its
+    estimated relative squared error around every pixel, shape (height, width, 1), the mean over 9x9 pixels.
+    These three are None with the preset paper.
     ``gain``, shape (height, width, 1), is what ``color`` was multiplied by at last to give back some of the
     radiance of fireflies (`fit.fireflies`); None without fireflies. The errors do not include what is lost of
     it.
