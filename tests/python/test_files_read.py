@@ -218,6 +218,39 @@ def test_a_layer_of_impossible_numbers_of_samples_is_ignored(
     assert "ignored: spp, because" in caplog.text
 
 
+def test_of_several_views_the_one_that_is_denoised_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = ["rgb.left", "rgb.right", "albedo.left", "albedo.right"]
+    images = {
+        name: {channel: pixels(3 * i + c) for c, channel in enumerate("RGB")} for i, name in enumerate(names)
+    }
+    OpenEXR.File(
+        [
+            OpenEXR.Part(
+                {"type": OpenEXR.scanlineimage, "view": name.partition(".")[2]},
+                {channel: image.copy() for channel, image in channels.items()},
+                name,
+            )
+            for name, channels in images.items()
+        ]
+    ).write(str(tmp_path / "parts.exr"))
+    read_buffers(tmp_path / "parts.exr")
+    assert "views left, right: only rgb.left.RGB is denoised" in caplog.text
+    right = read_buffers(tmp_path / "parts.exr", {"color": "rgb.right", "albedo": "albedo.right"})
+    for buffer, name in ((right.color, "rgb.right"), (right.albedo, "albedo.right")):
+        np.testing.assert_array_equal(buffer.mean, np.dstack(list(images[name].values())))
+
+    caplog.clear()
+    save(tmp_path / "layers.exr", *"RGB", *rgb("right"), multiView=["left", "right"])
+    read_buffers(tmp_path / "layers.exr")
+    assert "views left, right: only RGB is denoised" in caplog.text
+    caplog.clear()
+    save(tmp_path / "one.exr", *"RGB", view="left")
+    read_buffers(tmp_path / "one.exr")
+    assert not caplog.text
+
+
 def test_variance_of_unknown_scale_is_taken_only_when_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

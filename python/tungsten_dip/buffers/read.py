@@ -250,11 +250,29 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         _LOG.info("alpha: %s", groups["alpha"][0])
     if found.ignored:
         _LOG.info("ignored: %s", ", ".join(found.ignored))
+    views = _views(source.parts)
+    if len(views) > 1:
+        _LOG.warning(
+            "%s: views %s: only %s is denoised, with features that are found by name; choose the layers of "
+            "one view with --map, for each view in turn",
+            path,
+            ", ".join(views),
+            _shown(groups["color"]),
+        )
     return RenderBuffers(
         **buffers,
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
         source=replace(source, color_part=color_part, read=buffers),
     )
+
+
+def _views(parts: Sequence[Part]) -> list[str]:
+    """Return the names of the views, of a stereo pair for example, that a file's header says it holds."""
+    named: list[Any] = []
+    for part in parts:
+        several = part.attributes.get("multiView")
+        named += [*(several if isinstance(several, list) else ()), part.attributes.get("view")]
+    return list(dict.fromkeys(name for name in named if isinstance(name, str)))
 
 
 def _plane(
