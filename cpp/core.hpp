@@ -171,7 +171,8 @@ void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow wi
 // 2014); with a window's step above 1, those in every (step + 1)-th row and column. A neighbour's weight is
 // the non-local means weight of `guide` and its per-pixel `guide_variance` (same shape; without channels
 // every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) - feature_c(q))^2). `penalty` has
-// one value per feature. At most 16 features; everything must be finite.
+// one value per feature. At most 16 features; everything must be finite. Sums are float32: features should
+// differ by no more than some tens within a window; where they differ by some hundreds, results are useless.
 void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
              ConstImage guide_variance, SearchWindow window, Image out, int threads);
 

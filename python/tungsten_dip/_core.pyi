@@ -89,7 +89,8 @@ def regress(
 
     Neighbours weigh by non-local means of ``guide`` (``guide_variance`` is its noise, same shape), times
     exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``,
-    256 at most. At most 16 features; everything must be finite. See ``regress`` in core.hpp.
+    256 at most. At most 16 features; everything must be finite, and features should differ by no more than
+    some tens within a window. See ``regress`` in core.hpp.
     """
 
 def structure_tensor(features: FloatImage, threads: int) -> FloatImage:
