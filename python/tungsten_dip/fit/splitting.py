@@ -68,7 +68,7 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int | No
 
     Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is estimated
     from the difference of pixels and their surroundings. The same image and seed give the same halves,
-    whatever the exposure.
+    and the same image times a power of two gives these halves times it.
     """
     color = buffers.color
     test = compare_halves(buffers, threads)
@@ -132,27 +132,44 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     all channels are bright, but not of one that a spectral renderer traced for a single wavelength.
     """
     image = scaled(color, exposure(color))
-    drawn = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
+    random = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
     around = _core.box_mean(image, _MEAN_RADIUS, threads)
-    squared = (image - around).astype(np.float64) ** 2
-    noise = _core.box_mean(squared.astype(np.float32), _NOISE_RADIUS, threads).astype(np.float64)
     level = around.astype(np.float64) ** 2
-    # The edges of a lamp in plain view are mistaken for noise, but no half may be without it.
-    light = channel_mean(emitted)
-    lit = ((light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads)))[:, :, 0]
-    least_of_lamps = np.where(lit, _least_shape_of_lamps(light)[:, :, 0], 0)
-
-    def beta(level: _Plane, noise: _Plane, least: FloatArray | float) -> FloatArray:
-        shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
-        values = drawn.beta(shape / 2, shape / 2)
-        return np.where(shape < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
-
-    share = np.repeat(beta(level.sum(axis=2), noise.sum(axis=2), least_of_lamps)[:, :, None], 3, 2)
-    one_sample = level.sum(axis=2) < _SHAPE_OF_ONE_SAMPLE * noise.sum(axis=2)
-    apart = drawn.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]
+    noise = _noise_around(image, around, threads)
+    level_of_all, noise_of_all = level.sum(axis=2), noise.sum(axis=2)
+    lit, least_of_lamps = _lamps(channel_mean(emitted), threads)
+    share = _shares(random, level_of_all, noise_of_all, least_of_lamps)[:, :, None].repeat(3, axis=2)
+    one_sample = level_of_all < _SHAPE_OF_ONE_SAMPLE * noise_of_all
+    apart = random.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]
     apart &= ~lit & ~one_sample
-    share[apart] = beta(level[apart], noise[apart], 0)
+    share[apart] = _shares(random, level[apart], noise[apart], 0)
     return share
+
+
+def _shares(
+    random: np.random.Generator, level: _Plane, noise: _Plane, least: FloatArray | float
+) -> FloatArray:
+    """Draw T from Beta, for a squared level and a variance of any shape; ``least`` is a least shape."""
+    shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
+    values = random.beta(shape / 2, shape / 2)
+    return np.where(shape < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
+
+
+def _noise_around(image: FloatImage, around: FloatImage, threads: int) -> _Plane:
+    """Return the mean squared difference of the pixels around each from what is ``around`` them."""
+    squared = (image - around).astype(np.float64) ** 2
+    noise: _Plane = _core.box_mean(squared.astype(np.float32), _NOISE_RADIUS, threads).astype(np.float64)
+    return noise
+
+
+def _lamps(light: FloatImage, threads: int) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    """Return where lamps are in plain view, and the least shape there (else 0), each (height, width).
+
+    Their edges are mistaken for noise, but no half may be without them. ``light`` is their emission, shape
+    (height, width, 1).
+    """
+    lit = ((light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads)))[:, :, 0]
+    return lit, np.where(lit, _least_shape_of_lamps(light)[:, :, 0], 0)
 
 
 def _least_shape_of_lamps(light: FloatImage) -> FloatImage:
