@@ -156,11 +156,13 @@ def test_an_image_of_one_half_alone_is_one_without_halves(render: SyntheticRende
     np.testing.assert_array_equal(result.color, denoise(single, DRAFT).color)
 
 
-def test_halves_that_are_both_lost_do_not_agree(render: SyntheticRender) -> None:
+@pytest.mark.parametrize("variance", [False, True])
+def test_halves_that_are_both_lost_do_not_agree(variance: bool, render: SyntheticRender) -> None:
     nothing = np.full_like(render.buffers.color.mean, np.nan)
-    color = Buffer(nothing, nothing, nothing, nothing)
+    color = Buffer(nothing, nothing, nothing, nothing if variance else None)
     result = denoise(render.buffers.with_quantities(color=color), DRAFT)
-    assert "the image is black: the image is returned as it is" in result.notes
+    assert result.notes[-1] == "no pixel has any light: the image is returned as it is"
+    assert result.notes[0].startswith("repaired color")
 
 
 @pytest.mark.parametrize("missing", ["half_a", "half_b"])

@@ -91,10 +91,9 @@ class RenderBuffers:
     """Everything a renderer outputs for one image.
 
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies (0 in
-    pixels without a sample).
-    ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source that travels to the
-    output, ``source`` the channels of the file that was read, in their own pixel types, for the same purpose
-    (None for buffers that are not, or no longer, those of a file).
+    pixels without a sample). ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source
+    that travels to the output, ``source`` the channels of the file that was read, in their own pixel types,
+    for the same purpose (None for buffers that are not, or no longer, those of a file).
 
     Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, an
     array is not C-contiguous float32, or ``spp`` is neither a number above 0 nor an array of such and 0.

@@ -40,10 +40,11 @@ def result_without_noise(
     # Dark images are not mistaken for clean ones.
     bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
     estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
-    if max(estimated) >= _CONVERGED or estimated == [0]:
+    black = not squared.any()
+    if max(estimated) >= _CONVERGED or (estimated == [0] and not black):
         return None
     progress(1.0, "no noise")
-    why = "the halves agree to within a few thousandths" if squared.any() else "the image is black"
+    why = "no pixel has any light" if black else "the halves agree to within a few thousandths"
     error = channel_mean(bounded_ratio(noise, squared + RELMSE_EPSILON).astype(np.float32))
     return FitResult(
         color=color.mean.copy(),
