@@ -237,11 +237,12 @@ def test_of_several_views_the_one_that_is_denoised_is_told(
     ).write(str(tmp_path / "parts.exr"))
     read_buffers(tmp_path / "parts.exr")
     assert "views left, right: only rgb.left.RGB is denoised" in caplog.text
+    caplog.clear()
     right = read_buffers(tmp_path / "parts.exr", {"color": "rgb.right", "albedo": "albedo.right"})
     for buffer, name in ((right.color, "rgb.right"), (right.albedo, "albedo.right")):
         np.testing.assert_array_equal(buffer.mean, np.dstack(list(images[name].values())))
+    assert "views" not in caplog.text
 
-    caplog.clear()
     save(tmp_path / "layers.exr", *"RGB", *rgb("right"), multiView=["left", "right"])
     read_buffers(tmp_path / "layers.exr")
     assert "views left, right: only RGB is denoised" in caplog.text

@@ -11,7 +11,7 @@ from tungsten_dip._core import HalvesTest
 from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-__all__ = ["HalvesTest", "compare_halves", "with_both_halves", "without_foreign_halves"]
+__all__ = ["HalvesTest", "compare_halves", "without_foreign_halves", "without_single_halves"]
 
 _UNEQUAL = 0.5
 """How far a pixel may lie from (A + B) / 2, over |A - B| / 2. Halves of one and of two samples give 1/3."""
@@ -44,27 +44,21 @@ def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> Halves
     return _core.compare_halves(*color.halves, color.variance, thread_count(threads))
 
 
-def with_both_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
-    """Return buffers with the other half of what has one half alone, and a line for each quantity.
+def without_single_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return buffers without halves whose other half is missing, and a line for each quantity.
 
-    Half B is 2 times the mean minus half A, and never negative, except for normals.
+    Nothing tells whether such a half is one of the samples: its file may hold a light of its own.
     """
-    completed: dict[str, Buffer | None] = {}
+    without: dict[str, Buffer | None] = {}
     lines = []
     for name in ("color", *FEATURES):
         buffer = buffers.get(name)
-        if buffer is None or buffer.halves is not None:
+        if buffer is None or (buffer.half_a is None) == (buffer.half_b is None):
             continue
-        missing, half = ("A", buffer.half_b) if buffer.half_a is None else ("B", buffer.half_a)
-        if half is None:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            other = 2 * buffer.mean - half
-        if name != "normal":
-            np.maximum(other, 0, out=other)  # where rounding made it negative
-        completed[name] = replace(buffer, **{f"half_{missing.lower()}": other})
-        lines.append(f"{name}: half {missing} is missing, and is computed from the mean and the other half")
-    return buffers.with_quantities(**completed), tuple(lines)
+        half, missing = ("A", "B") if buffer.half_b is None else ("B", "A")
+        without[name] = replace(buffer, half_a=None, half_b=None)
+        lines.append(f"{name}: half buffer {half} is not used, because {missing} is missing")
+    return buffers.with_quantities(**without), tuple(lines)
 
 
 def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:

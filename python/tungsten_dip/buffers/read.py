@@ -251,7 +251,7 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     if found.ignored:
         _LOG.info("ignored: %s", ", ".join(found.ignored))
     views = _views(source.parts)
-    if len(views) > 1:
+    if len(views) > 1 and "color" not in source.mapping:
         _LOG.warning(
             "%s: views %s: only %s is denoised, with features that are found by name; choose the layers of "
             "one view with --map, for each view in turn",

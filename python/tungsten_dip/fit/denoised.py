@@ -32,15 +32,15 @@ def result_without_noise(
     Copies do not differ at all: they count as free of noise only if the variance confirms it.
     """
     color = buffers.color
-    if color.halves is None:
-        return None
-    a, b = color.halves
     squared = color.mean.astype(np.float64) ** 2
+    black = not squared.any()
+    if color.halves is None and not black:
+        return None
+    a, b = color.halves_or_mean
     noise = (a - b).astype(np.float64) ** 2 / 4
     # Dark images are not mistaken for clean ones.
     bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
     estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
-    black = not squared.any()
     if max(estimated) >= _CONVERGED or (estimated == [0] and not black):
         return None
     progress(1.0, "no noise")
@@ -53,7 +53,7 @@ def result_without_noise(
         iterations=0,
         error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
         estimated_relmse=float(error.mean(dtype=np.float64)),
-        halves=color.halves,
+        halves=(a, b),
         notes=(f"{why}: the image is returned as it is",),
     )
 

@@ -93,8 +93,8 @@ def crossed_errors(noisy: Halves, fused: Halves) -> tuple[FloatArray, FloatArray
     ``noisy`` are independent images a, b of the truth, and ``fused`` the results f_a, f_b of one of them
     each. The residuals f_a - a and f_b - b are independent, and the mean of each is the bias of a result, so
     that the mean of their product is the squared bias. (f_a - f_b)^2 / 2 is in the mean the variance of one
-    result, and half of it that of (f_a + f_b) / 2. Where float32 overflows, both errors are infinite, or the
-    first is NaN.
+    result, and half of it that of (f_a + f_b) / 2. Where float32 overflows, either may be infinite, and the
+    first NaN.
     """
     (a, b), (fused_a, fused_b) = noisy, fused
     with np.errstate(over="ignore", invalid="ignore"):

@@ -3,7 +3,7 @@
 The network's inputs (`inputs`) are those of one pixel of one half. It outputs the weights of a mean of
 the pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". The noise of
 the other half is independent: it adds a constant to the loss and does not enter the image, whose mean is
-preserved.
+preserved but for errors so large that the loss bounds them (`pointwise`).
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ class PointwiseNetwork:
         self._members = self._states(weights)
 
     def step(self, batch: Examples, learning_rate: float) -> None:
-        """Train every member on some pixels by one step of Adam: their weighted squared errors fall."""
+        """Train every member on some pixels by one step of Adam: their loss falls."""
         self._steps_done += 1
         feeds = {
             "inputs": batch.inputs,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.buffers.half_buffers import with_both_halves, without_foreign_halves
+from tungsten_dip.buffers.half_buffers import without_foreign_halves, without_single_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
@@ -50,7 +50,7 @@ def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
         _LOG.warning(
             "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
-    buffers, single = with_both_halves(buffers)
+    buffers, single = without_single_halves(buffers)
     buffers, foreign = without_foreign_halves(buffers)
     rendered = buffers.color
     buffers, repaired = sanitize(buffers, threads)
@@ -62,11 +62,11 @@ def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
 def _without_lost_halves(
     buffers: RenderBuffers, rendered: Buffer, threads: int | None
 ) -> tuple[RenderBuffers, tuple[str, ...]]:
-    """Return sanitised buffers with halves drawn where one half alone is left, and a note if there are any.
+    """Return sanitised buffers with halves drawn where a half is lost, and a note if there are such pixels.
 
-    ``rendered`` is the colour before it was sanitised. A copy of the half that is left would confirm all of
-    its noise, and neighbouring pixels have less noise than it. Lamps, which are equal in both halves, stay as
-    they are: nothing of them is lost.
+    ``rendered`` is the colour before it was sanitised. There one half alone is left, or the mean alone.
+    Copies of it would confirm all of its noise, and neighbouring pixels have less noise than it. Lamps, which
+    are equal in both halves, stay as they are: nothing of them is lost.
     """
     color = buffers.color
     if color is rendered or rendered.halves is None or color.halves is None:
@@ -77,19 +77,19 @@ def _without_lost_halves(
         ~known | (rendered.mean == half).all(axis=2, keepdims=True) for half in rendered.halves
     )
     only_a, only_b = known_a & ~known_b & alone_a, known_b & ~known_a & alone_b
-    lost = only_a | only_b
+    lost = only_a | only_b | (known & ~known_a & ~known_b)
     count = np.count_nonzero(lost)
     if count == 0:
         return buffers, ()
     half_a, half_b = color.halves
     mean = np.where(only_a, half_a, np.where(only_b, half_b, color.mean))
     if count == lost.size:
-        note = "one half of the samples is lost in every pixel"
+        note = "half buffers are lost in every pixel"
         return buffers.with_quantities(color=Buffer(mean)), (note,)
     buffers = buffers.with_quantities(color=replace(color, mean=mean))
     note = (
-        f"one half of the samples is lost in {count} of {lost.size} pixels: the noise of the other half, "
-        "estimated from the surrounding pixels, is split at random into two"
+        f"half buffers are lost in {count} of {lost.size} pixels: the noise of what is left there, estimated "
+        "from the surrounding pixels, is split at random into two"
     )
     return with_lost_halves_drawn(buffers, lost, threads), (note,)
 

@@ -12,6 +12,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.fit.neighbours import window_pixels
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
@@ -243,7 +244,8 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     if albedo.halves is None or not (albedo.mean > 1).any():
         return albedo
     emissions = [np.maximum(half - 1, 0) for half in albedo.halves]
-    around = np.float32(2 * 3**2) * _core.box_mean(mean_of((emissions[0], emissions[1])), 1, threads)
+    both = emissions[0] + emissions[1]
+    around = window_pixels(both.shape, 1) * _core.box_mean(both, 1, threads)
     kept_a, kept_b = (
         np.minimum(half, 1 + np.maximum(_STRAY * other, _STRAY_AROUND * (around - own)))
         for half, own, other in zip(albedo.halves, emissions, emissions[::-1], strict=True)

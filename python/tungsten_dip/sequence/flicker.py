@@ -39,9 +39,10 @@ def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_n
     have in common.
     """
     d_fused, d_noisy = _change(fused, previous), _change(noisy, previous_noisy)
-    denominator = _denominator(mean_of(fused), mean_of(previous))
-    of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_fused))
-    mean, standard_error = mean_and_standard_error(of_one - variance)
+    with np.errstate(over="ignore", invalid="ignore"):
+        denominator = _denominator(mean_of(fused), mean_of(previous))
+        of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_fused))
+        mean, standard_error = mean_and_standard_error(of_one - variance)
     return mean if is_sure(mean, standard_error) else float(variance.mean(dtype=np.float64))
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from tungsten_dip.buffers.prefilter import prefilter_feature
-from tungsten_dip.buffers.render_buffers import FEATURES, Halves, Quantity, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
@@ -24,6 +24,7 @@ from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
+from tungsten_dip.fit.surfaces import alpha_as_albedo
 from tungsten_dip.onnx.inference import infer_fusion
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
@@ -206,8 +207,9 @@ class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
 
 
-def _features(buffers: RenderBuffers) -> list[Quantity]:
-    return [name for name in FEATURES if buffers.get(name) is not None]
+def _features(buffers: RenderBuffers) -> list[str]:
+    of_alpha = [] if alpha_as_albedo(buffers) is None else ["alpha"]
+    return [name for name in FEATURES if buffers.get(name) is not None] + of_alpha
 
 
 def _is_new(network: Model | None, model: Model | None) -> bool:
