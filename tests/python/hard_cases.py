@@ -377,7 +377,8 @@ def _depth_of_sky(value: float) -> Callable[[FloatImage, Damaged], FloatImage]:
 _NO_EDGES = {
     "mean": "edges that no feature contains are detected in the noisy colour, which darkens small images"
 }
-_BEYOND = {"exposure": "exposures are compensated up to a factor of 2^100"}
+_TOO_DARK = {"exposure": "float32 has no power of two that brings such radiance to the usual level"}
+_BEYOND = {"exposure": "exposures are compensated up to a factor of 2^126"}
 _EMITTED = {"exposure": "albedo above 1 is emission, in the renderer's units"}
 
 
@@ -401,7 +402,7 @@ def _cases() -> Iterator[HardCase]:
     group = "Radiance"
     yield HardCase(group, "half-float overflow", _half_floats)
     yield HardCase(group, "negative, from filter lobes", _filter_lobes)
-    yield HardCase(group, "subnormal (1e-40)", lambda: _scaled(1e-40))
+    yield HardCase(group, "subnormal (1e-40)", lambda: _scaled(1e-40), _TOO_DARK)
     yield HardCase(group, "around 1e-8", lambda: _scaled(1e-8))
     yield HardCase(group, "around 1e6", lambda: _scaled(1e6))
     yield HardCase(group, "around 1e30", lambda: _scaled(1e30), _BEYOND)
