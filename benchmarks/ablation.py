@@ -17,7 +17,7 @@ from unittest import mock
 from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, evidence, fusion, surfaces
+from tungsten_dip.fit import FitSettings, blending, denoise, evidence, surfaces
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.report.metrics import compare
 
@@ -25,23 +25,23 @@ Change = Callable[[], AbstractContextManager[object]]
 
 
 def _without(unwanted: Callable[[Pilot], bool]) -> Change:
-    preset = fusion._PRESETS["balanced"]
+    preset = blending._PRESETS["balanced"]
     kept = tuple(pilot for pilot in preset.pilots if not unwanted(pilot))
-    return lambda: mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=kept))
+    return lambda: mock.patch.dict(blending._PRESETS, balanced=replace(preset, pilots=kept))
 
 
 def _with_one_pilot() -> AbstractContextManager[object]:
-    preset = fusion._PRESETS["balanced"]
-    return mock.patch.dict(fusion._PRESETS, balanced=replace(preset, pilots=(Pilot(10, k=1.0, step=2),)))
+    preset = blending._PRESETS["balanced"]
+    return mock.patch.dict(blending._PRESETS, balanced=replace(preset, pilots=(Pilot(10, k=1.0, step=2),)))
 
 
 VARIANTS: dict[str, Change] = {
-    "balanced": lambda: mock.patch.dict(fusion._PRESETS),
+    "balanced": lambda: mock.patch.dict(blending._PRESETS),
     "hardly trained (1 step)": lambda: mock.patch.object(
-        fusion, "_PRESETS", {"balanced": replace(fusion._PRESETS["balanced"], steps=1)}
+        blending, "_PRESETS", {"balanced": replace(blending._PRESETS["balanced"], steps=1)}
     ),
     "one network instead of two": lambda: mock.patch.object(
-        fusion, "_PRESETS", {"balanced": replace(fusion._PRESETS["balanced"], members=1)}
+        blending, "_PRESETS", {"balanced": replace(blending._PRESETS["balanced"], members=1)}
     ),
     "one pilot and the noisy image": _with_one_pilot,
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
@@ -53,7 +53,7 @@ VARIANTS: dict[str, Change] = {
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         surfaces, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
-    "no pilots of all samples": lambda: mock.patch.object(fusion, "pilots_of_all_samples", return_value=()),
+    "no pilots of all samples": lambda: mock.patch.object(blending, "pilots_of_all_samples", return_value=()),
     "empty space like any other": lambda: mock.patch.object(evidence, "_occupied", return_value=1),
 }
 

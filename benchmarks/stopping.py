@@ -15,8 +15,8 @@ import numpy as np
 
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, fusion
-from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork
+from tungsten_dip.fit import FitSettings, blending, denoise
+from tungsten_dip.fit.blend_network import BlendNetwork, Examples
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import Start, start_of_training
 from tungsten_dip.report.metrics import compare
@@ -30,7 +30,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
     found: list[float] = []
     starts: list[Start] = []
 
-    class Watched(PointwiseNetwork):
+    class Watched(BlendNetwork):
         steps = 0
 
         def step(self, batch: Examples, learning_rate: float) -> None:
@@ -39,7 +39,9 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
             if self.steps % EVERY == 0:
                 evidence, examples = starts[-1].evidence, starts[-1].examples
                 of_halves = [
-                    self.fuse(examples.of_half(half).inputs, [choice[half] for choice in evidence.choices])
+                    self.blend(
+                        examples.of_half(half).inputs, [candidate[half] for candidate in evidence.candidates]
+                    )
                     for half in (0, 1)
                 ]
                 image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])
@@ -50,8 +52,8 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
         return starts[-1]
 
     with (
-        mock.patch.object(fusion, "PointwiseNetwork", Watched),
-        mock.patch.object(fusion, "start_of_training", start),
+        mock.patch.object(blending, "BlendNetwork", Watched),
+        mock.patch.object(blending, "start_of_training", start),
     ):
         denoise(bench_set.buffers, FitSettings(preset))
     return found

@@ -164,7 +164,7 @@ def test_an_interrupted_fit_leaves_the_render_and_the_scenes_before_it(
             raise KeyboardInterrupt
         return finished(buffers, settings, progress)
 
-    monkeypatch.setattr("tungsten_dip.sequence.following.fit_fusion", interrupted)
+    monkeypatch.setattr("tungsten_dip.sequence.following.fit_blend", interrupted)
     assert tungsten.main(["--dip-denoise", *map(str, scenes)]) == 130
     names = {path.name for path in tmp_path.iterdir()} - {path.name for path in scenes}
     assert names == {

@@ -26,26 +26,26 @@ def _noisy(sigma: float, seed: int) -> Halves:
     return a, b
 
 
-def _mean_estimate(pilots: list[Halves], fused: Halves) -> float:
-    errors: FloatArray = estimate_error(pilots, 1.0, fused)
+def _mean_estimate(pilots: list[Halves], denoised: Halves) -> float:
+    errors: FloatArray = estimate_error(pilots, 1.0, denoised)
     assert errors.shape == (PIXELS,)
     return float(errors.mean(dtype=np.float64))
 
 
 def test_where_the_noisy_halves_tell_nothing_the_bias_is_between_variance_and_spread_of_pilots() -> None:
     pilots = [_noisy(30, seed=0), *(_constant(TRUTH + apart) for apart in (0.1, -0.2, 0.3))]
-    fused = _constant(TRUTH + 0.05)[0], _constant(TRUTH - 0.05)[0]
+    denoised = _constant(TRUTH + 0.05)[0], _constant(TRUTH - 0.05)[0]
     expected = (0.05**2 + 2.4 * 0.05 * 0.2) * RELATIVE
-    assert _mean_estimate(pilots, fused) == pytest.approx(expected, rel=1e-3)
+    assert _mean_estimate(pilots, denoised) == pytest.approx(expected, rel=1e-3)
 
 
 def test_pilots_that_blur_prove_no_bias_that_the_halves_deny() -> None:
     """The true error is next to nothing: no more than some standard errors of the halves' may be claimed."""
     sigma = 0.1
     pilots = [_noisy(sigma, seed=1), *(_constant(TRUTH + 0.5) for _ in range(3))]
-    fused = _constant(TRUTH + 0.001)[0], _constant(TRUTH - 0.001)[0]
+    denoised = _constant(TRUTH + 0.001)[0], _constant(TRUTH - 0.001)[0]
     standard_error = sigma**2 / np.sqrt(3 * PIXELS) * RELATIVE
-    assert 0 < _mean_estimate(pilots, fused) < 8 * standard_error
+    assert 0 < _mean_estimate(pilots, denoised) < 8 * standard_error
 
 
 def test_what_the_halves_tell_contains_the_variance() -> None:
@@ -69,12 +69,12 @@ def test_the_error_is_that_of_the_other_half_also_beside_bright_noise() -> None:
     rng = np.random.default_rng(6)
     noisy = _noisy(1, seed=7)
     noisy[0][::2] = 1e6 * rng.random((PIXELS // 2, 3), np.float32)
-    fused = _noisy(0.1, seed=8)
-    of_one, variance = crossed_errors(noisy, fused)
-    a, b, fused_a, fused_b = (image.astype(np.float64) for image in (*noisy, *fused))
-    exact = ((fused_a - b) ** 2 + (fused_b - a) ** 2 - (a - b) ** 2) / 2
+    denoised = _noisy(0.1, seed=8)
+    of_one, variance = crossed_errors(noisy, denoised)
+    a, b, denoised_a, denoised_b = (image.astype(np.float64) for image in (*noisy, *denoised))
+    exact = ((denoised_a - b) ** 2 + (denoised_b - a) ** 2 - (a - b) ** 2) / 2
     np.testing.assert_allclose(of_one, exact, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(variance, (fused_a - fused_b) ** 2 / 4, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(variance, (denoised_a - denoised_b) ** 2 / 4, rtol=1e-5, atol=1e-6)
 
 
 def test_an_input_as_good_as_what_is_fitted_to_it_is_returned(render: SyntheticRender) -> None:

@@ -68,8 +68,8 @@ def test_errors_are_relative_to_the_darker_of_the_last_pilot_and_the_median_one(
 def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:
     """It counts as 20 times the mean error of a half by itself in the 17x17 pixels around."""
     noisy, flat = np.ones((40, 40, 3), np.float32), np.zeros((40, 40, 3), np.float32)
-    choices, ones = ((noisy, 2 * noisy), (flat, flat)), np.ones((40, 40, 1), np.float32)
-    caps = _caps(choices, (ones, ones), 1)
+    candidates, ones = ((noisy, 2 * noisy), (flat, flat)), np.ones((40, 40, 1), np.float32)
+    caps = _caps(candidates, (ones, ones), 1)
     np.testing.assert_allclose(caps[0], 20, rtol=1e-3)
     np.testing.assert_allclose(caps[1], 80, rtol=1e-3)
     error = np.zeros((40, 40, 1), np.float32)

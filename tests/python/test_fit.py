@@ -1,4 +1,4 @@
-"""Denoising by fusion: closer to the truth than its input, honest about its error, safe with any input."""
+"""Blends of pilots: closer to the truth than their input, honest about their error, safe with any input."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from fitted_models import check_result
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, fusion, training
+from tungsten_dip.fit import FitSettings, blending, denoise, training
+from tungsten_dip.fit.blend_network import Examples
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.evidence import pilots_of_all_samples
-from tungsten_dip.fit.fusion import fit_fusion
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -28,7 +29,6 @@ from tungsten_dip.fit.pilots import (
     PilotMaker,
     first_guides,
 )
-from tungsten_dip.fit.pointwise import Examples
 from tungsten_dip.fit.preparation import prepared
 from tungsten_dip.fit.surfaces import Surfaces, surfaces_of_halves
 from tungsten_dip.fit.training import Training, _batches
@@ -299,7 +299,7 @@ def oidn_images(monkeypatch: pytest.MonkeyPatch) -> list[FloatImage]:
     return images
 
 
-def test_a_good_candidate_is_chosen(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
+def test_a_good_extra_pilot_is_used(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
     alone = denoise(render.buffers, _settings())
     truth = render.reference
     oidn_images[:] = truth, truth
@@ -308,7 +308,7 @@ def test_a_good_candidate_is_chosen(render: SyntheticRender, oidn_images: list[F
     assert relmse(together.color, truth) < relmse(alone.color, truth) / 2
 
 
-def test_a_bad_candidate_does_little_harm(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
+def test_a_bad_extra_pilot_does_little_harm(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
     alone = denoise(render.buffers, _settings(iterations=80))
     oidn_images[:] = np.zeros_like(render.reference), 10 * render.reference
     together = denoise(render.buffers, _settings(iterations=80, pilot="oidn"))
@@ -390,7 +390,7 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
         if message.startswith("relMSE"):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fusion, "pilots_of_all_samples", until_given_up)
+    monkeypatch.setattr(blending, "pilots_of_all_samples", until_given_up)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2, iterations=100_000), interrupt)
     check_result(result, render.buffers)
     assert told == [True]
@@ -440,8 +440,8 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
         told.append(arguments[-1].wait(timeout=60))
         return pilots_of_all_samples(*arguments)
 
-    monkeypatch.setattr(fusion, "wait", wait_or_interrupt)
-    monkeypatch.setattr(fusion, "pilots_of_all_samples", after_training)
+    monkeypatch.setattr(blending, "wait", wait_or_interrupt)
+    monkeypatch.setattr(blending, "pilots_of_all_samples", after_training)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2))
     check_result(result, render.buffers)
     assert told == [True, True]
@@ -461,8 +461,8 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
         assert threads == 1 or arguments[-1].wait(timeout=60)
         return ()
 
-    monkeypatch.setattr(fusion, "train", fail)
-    monkeypatch.setattr(fusion, "pilots_of_all_samples", until_given_up)
+    monkeypatch.setattr(blending, "train", fail)
+    monkeypatch.setattr(blending, "pilots_of_all_samples", until_given_up)
     with pytest.raises(InputError, match="a test's"):
         denoise(render.buffers, _settings(preset="balanced", threads=threads))
 
@@ -722,10 +722,10 @@ def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
     known = reference.copy()
     known[height // 2 :] = np.nan
     settings = FitSettings(preset="draft", threads=1)
-    result = fit_fusion(buffers, settings, silent, previous=(known, known))
+    result = fit_blend(buffers, settings, silent, previous=(known, known))
     alone = denoise(buffers, settings)
     assert np.isfinite(result.color).all()
-    assert result.model.layout.candidate_count == 1
+    assert result.model.layout.extra_count == 1
 
     def error(image, rows):
         return float(np.mean((image[rows] - reference[rows]) ** 2))
@@ -748,7 +748,7 @@ def test_empty_space_stays_black_whatever_the_previous_frame_shows(render):
     buffers = replace(buffers, color=Buffer((a + b) / 2, a, b), depth=Buffer(nothing))
     bright = np.full_like(render.reference, 2.0)
     settings = FitSettings(preset="draft", threads=1)
-    result = fit_fusion(buffers, settings, silent, previous=(bright, bright))
+    result = fit_blend(buffers, settings, silent, previous=(bright, bright))
     assert not result.color[:17, :17].any()
     assert result.color[~empty].any()
 

@@ -29,8 +29,8 @@ def test_noise_around_a_good_result_changes_nothing_that_is_seen() -> None:
 def test_what_both_halves_show_is_given_back(lost: float, leaked: float) -> None:
     truth = np.full(SHAPE, 0.2, np.float32)
     truth[10:13, 20:24] = lost
-    fused = np.full(SHAPE, leaked, np.float32)
-    given = with_lost_detail(_halves(truth, 32.0), (fused, fused))
+    denoised = np.full(SHAPE, leaked, np.float32)
+    given = with_lost_detail(_halves(truth, 32.0), (denoised, denoised))
     mean = (given[0] + given[1]) / 2
     np.testing.assert_allclose(mean[10:13, 20:24].mean(), lost, rtol=0.1)
     assert np.abs(mean[20:] - leaked).mean() < 0.002
@@ -48,44 +48,44 @@ def test_nothing_is_given_back_on_the_word_of_one_half() -> None:
 @pytest.mark.parametrize(("pixels", "given_back"), [(2, False), (12, True)])
 def test_nothing_is_given_back_on_the_word_of_a_few_pixels(pixels: int, given_back: bool) -> None:
     """Both halves may have seen the same rare light by chance."""
-    fused = np.full(SHAPE, 0.2, np.float32)
-    noisy = fused.copy()
+    denoised = np.full(SHAPE, 0.2, np.float32)
+    noisy = denoised.copy()
     noisy[5, 5 : 5 + pixels] = 3
-    for image in with_lost_detail((noisy, noisy), (fused, fused)):
-        np.testing.assert_allclose(image, noisy if given_back else fused, rtol=1e-5)
+    for image in with_lost_detail((noisy, noisy), (denoised, denoised)):
+        np.testing.assert_allclose(image, noisy if given_back else denoised, rtol=1e-5)
 
 
 def test_detail_is_given_back_to_the_dark_as_well() -> None:
-    fused = np.full(SHAPE, 0.01, np.float32)
-    noisy = fused.copy()
+    denoised = np.full(SHAPE, 0.01, np.float32)
+    noisy = denoised.copy()
     noisy[5:8, 5:15] = 0.03
-    for image in with_lost_detail((noisy, noisy), (fused, fused)):
+    for image in with_lost_detail((noisy, noisy), (denoised, denoised)):
         np.testing.assert_allclose(image, noisy, rtol=1e-5)
 
 
 def test_pixels_that_no_sample_lit_are_not_confirmed_by_drawn_halves() -> None:
-    fused = np.full(SHAPE, 0.2, np.float32)
+    denoised = np.full(SHAPE, 0.2, np.float32)
     halves = np.full(SHAPE, 0.3, np.float32), np.full(SHAPE, 0.25, np.float32)
     for half in halves:
         half[5:8, 5:15] = 0
-    for image in with_lost_detail(halves, (fused, fused), drawn=True):
+    for image in with_lost_detail(halves, (denoised, denoised), drawn=True):
         assert image.min() == np.float32(0.2)
-    assert with_lost_detail(halves, (fused, fused))[0].min() < 0.01
+    assert with_lost_detail(halves, (denoised, denoised))[0].min() < 0.01
 
 
 @pytest.mark.parametrize("size", [(1, 1, 3), (1, 9, 3), (7, 5, 3)])
 @pytest.mark.parametrize("radiance", [0.0, 0.3, 1e15])
 def test_any_size_and_radiance_stays_finite(size: tuple[int, ...], radiance: float) -> None:
     halves = np.full(size, radiance, np.float32), np.zeros(size, np.float32)
-    for fused in (np.zeros(size, np.float32), np.full(size, 1e15, np.float32)):
-        for image in with_lost_detail(halves, (fused, fused.copy())):
+    for denoised in (np.zeros(size, np.float32), np.full(size, 1e15, np.float32)):
+        for image in with_lost_detail(halves, (denoised, denoised.copy())):
             assert np.isfinite(image).all()
             assert (image >= 0).all()
 
 
 def test_no_input_is_modified() -> None:
-    halves, fused = _halves(np.full(SHAPE, 0.01, np.float32)), _halves(np.full(SHAPE, 1.0, np.float32))
-    copies = [image.copy() for image in (*halves, *fused)]
-    with_lost_detail(halves, fused)
-    for image, copy in zip((*halves, *fused), copies, strict=True):
+    halves, denoised = _halves(np.full(SHAPE, 0.01, np.float32)), _halves(np.full(SHAPE, 1.0, np.float32))
+    copies = [image.copy() for image in (*halves, *denoised)]
+    with_lost_detail(halves, denoised)
+    for image, copy in zip((*halves, *denoised), copies, strict=True):
         np.testing.assert_array_equal(image, copy)

@@ -11,9 +11,9 @@ from hypothesis import given, settings, strategies
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings
+from tungsten_dip.fit.blend_network import first_weights
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pointwise import first_weights
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import load_model, save_model
@@ -58,7 +58,7 @@ def test_round_trip(model: Model, saved: Path) -> None:
         min_size=1,
         max_size=4,
     ),
-    candidates=strategies.integers(0, 2),
+    extra_count=strategies.integers(0, 2),
     relmse=strategies.none() | strategies.floats(0, 1e9),
     seed=strategies.integers(0, 2**63 - 1),
     members=strategies.integers(1, 16),
@@ -67,14 +67,14 @@ def test_round_trip(model: Model, saved: Path) -> None:
 def test_every_model_survives_its_file(
     features: list[str],
     pilots: list[Pilot],
-    candidates: int,
+    extra_count: int,
     relmse: float | None,
     seed: int,
     members: int,
     data: strategies.DataObject,
 ) -> None:
-    baseline = data.draw(strategies.integers(1, len(pilots) + candidates))
-    layout = Layout(tuple(features), tuple(pilots), candidates, baseline)
+    baseline = data.draw(strategies.integers(1, len(pilots) + extra_count))
+    layout = Layout(tuple(features), tuple(pilots), extra_count, baseline)
     inputs = len(layout.inputs)
     constants = Standardisation(np.linspace(-9, 9, inputs), np.full(inputs, 0.3, np.float32))
     fit = Model(

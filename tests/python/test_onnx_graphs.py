@@ -16,14 +16,14 @@ from fitted_models import DRAFT, paper_model, session_of
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise
-from tungsten_dip.fit.fusion import fit_fusion
+from tungsten_dip.fit.blend_network import Examples, first_weights
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pointwise import Examples, first_weights
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import infer, inference
 from tungsten_dip.onnx.file import proto_from_model
-from tungsten_dip.onnx.inference import infer_fusion
+from tungsten_dip.onnx.inference import infer_blend
 from tungsten_dip.progress import silent
 
 torch = pytest.importorskip("torch")
@@ -79,23 +79,23 @@ def test_inference_repeats_the_fit(fitted: FitResult, model: Model, frame: Synth
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_pointwise_agrees_with_torch_at_sizes_never_exported(size: tuple[int, int], model: Model) -> None:
+def test_a_blend_agrees_with_torch_at_sizes_never_exported(size: tuple[int, int], model: Model) -> None:
     assert model.layout is not None
     assert model.standardisation is not None
     rng = np.random.default_rng(0)
     height, width = size
     inputs = rng.normal(0, 2, (2, len(model.inputs), height, width)).astype(np.float32)
-    choices = rng.random((2, model.layout.choice_count, 3, height, width), np.float32)
-    color = session_of(model).run(None, {"inputs": inputs, "choices": choices})[0]
+    candidates = rng.random((2, model.layout.candidate_count, 3, height, width), np.float32)
+    color = session_of(model).run(None, {"inputs": inputs, "candidates": candidates})[0]
     assert color.shape == (2, 3, height, width)
 
     flat = inputs.reshape(2, len(model.inputs), -1).transpose(0, 2, 1).copy()
     model.standardisation.apply(flat, threads=1)
-    flat_choices = choices.reshape(2, model.layout.choice_count, 3, -1).transpose(0, 3, 1, 2).copy()
+    flat_candidates = candidates.reshape(2, model.layout.candidate_count, 3, -1).transpose(0, 3, 1, 2).copy()
     network = TorchNetwork(model.weights)
     for half in (0, 1):
-        examples = Examples(flat[half], flat_choices[half], flat_choices[half, :, 0], flat[half, :, :1])
-        expected = network.fuse(examples).T.reshape(3, height, width)
+        examples = Examples(flat[half], flat_candidates[half], flat_candidates[half, :, 0], flat[half, :, :1])
+        expected = network.blend(examples).T.reshape(3, height, width)
         np.testing.assert_allclose(color[half], expected, rtol=1e-4)
 
 
@@ -163,15 +163,15 @@ def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> N
     weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
     fit = Model(layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
-    choices = rng.random((2, 2, 3, 6, 7), np.float32)
-    color = session_of(fit).run(None, {"inputs": raw, "choices": choices})[0]
+    candidates = rng.random((2, 2, 3, 6, 7), np.float32)
+    color = session_of(fit).run(None, {"inputs": raw, "candidates": candidates})[0]
     standardisation.apply(flat, threads=1)
     x = flat.astype(np.float64)
     for layer in (1, 2, 3):
         x = x @ weights[f"layer{layer}.weight"][:, :, 0, 0].T + weights[f"layer{layer}.bias"]
         x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
     shares = np.exp(x) / np.exp(x).sum(2, keepdims=True)
-    expected = np.einsum("hps,hscp->hcp", shares, choices.reshape(2, 2, 3, -1))
+    expected = np.einsum("hps,hscp->hcp", shares, candidates.reshape(2, 2, 3, -1))
     np.testing.assert_allclose(color.reshape(2, 3, -1), expected, rtol=1e-5)
 
 
@@ -217,13 +217,13 @@ def test_without_halves_the_noise_is_split(model: Model, frame: SyntheticRender)
         assert np.mean((result.color - frame.reference) ** 2) < noisy / 4
 
 
-def test_candidates_reach_the_network(frame: SyntheticRender) -> None:
+def test_extra_pilots_reach_the_network(frame: SyntheticRender) -> None:
     truth = frame.reference
-    fit = fit_fusion(frame.buffers, DRAFT, silent, previous=(truth, truth))
+    fit = fit_blend(frame.buffers, DRAFT, silent, previous=(truth, truth))
     assert fit.model is not None
-    inferred = infer_fusion(fit.model, frame.buffers, DRAFT, silent, previous=(truth, truth))
+    inferred = infer_blend(fit.model, frame.buffers, DRAFT, silent, previous=(truth, truth))
     np.testing.assert_allclose(inferred.color, fit.color, rtol=1e-5)
-    with pytest.raises(InputError, match=r"fitted with 1 candidates .*, this input comes with 0"):
+    with pytest.raises(InputError, match=r"fitted with 1 extra pilots .*, this input comes with 0"):
         infer(fit.model, frame.buffers)
 
 

@@ -171,9 +171,9 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (many_nodes, "too many parts"),
     (long_name, "beside the weights"),
     (no_metadata, "tungsten-dip wrote"),
-    (metadata('"format": 7', '"format": 1'), "expected format 7, found 1"),
+    (metadata('"format": 8', '"format": 1'), "expected format 8, found 1"),
     (metadata('"preset": "draft"', '"preset": "paper"'), "weight|network"),
-    (metadata('"candidates": 0', '"candidates": 1000000000000'), "inputs|layout"),
+    (metadata('"extra_pilots": 0', '"extra_pilots": 1000000000000'), "inputs|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
     (metadata('"step": 1', '"step": 0'), "radius"),
     (metadata('"k": 1.0', '"k": 1e-30'), "k from"),
@@ -181,7 +181,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"radius": 1', f'"radius": {10**400}'), "radius: found 1000"),
     (metadata('"estimated_relmse": ', '"estimated_relmse": 1e400, "was": '), "estimated_relmse: found inf"),
     (metadata('"estimated_relmse": ', f'"estimated_relmse": {10**400}, "was": '), "relmse: found 1000"),
-    (metadata('"format": 7', f'"format": {10**400}'), "expected format 7, found 1000"),
+    (metadata('"format": 8', f'"format": {10**400}'), "expected format 8, found 1000"),
     (metadata('"pilots": [', '"pilots": [' + 70 * PILOT), "at most 64 images"),
     (metadata('"step": 1', '"step": true'), "step"),
     (metadata('"with_position"', '"mean"'), "pilots"),
@@ -196,7 +196,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (whole_metadata("[" * 100_000), "JSON"),
     (whole_metadata("{"), "JSON"),
     (whole_metadata("[]"), "format"),
-    (whole_metadata('{"format": 7}'), "settings"),
+    (whole_metadata('{"format": 8}'), "settings"),
 ]
 
 

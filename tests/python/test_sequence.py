@@ -14,7 +14,7 @@ from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import pointwise, training
+from tungsten_dip.fit import blend_network, training
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -363,16 +363,20 @@ def test_the_halves_tell_the_flicker(bias):
     references = [0.5 + 0.3 * rng.random(shape), 0.5 + 0.3 * rng.random(shape)]
     noisy = [[r + noise * rng.standard_normal(shape) for _ in "ab"] for r in references]
     # A tenth of a half's noise is left in what is made of it, and a bias of alternating sign.
-    fused = [
+    denoised = [
         [r + 0.1 * (half - r) + sign * bias for half in halves]
         for r, halves, sign in zip(references, noisy, (-1, 1), strict=True)
     ]
-    noisy, fused = ([tuple(np.float32(h) for h in halves) for halves in pair] for pair in (noisy, fused))
-    true = flicker(*(np.mean(halves, axis=0) for halves in fused[::-1]), *map(np.float32, references[::-1]))
+    noisy, denoised = (
+        [tuple(np.float32(h) for h in halves) for halves in pair] for pair in (noisy, denoised)
+    )
+    true = flicker(
+        *(np.mean(halves, axis=0) for halves in denoised[::-1]), *map(np.float32, references[::-1])
+    )
     known = 2 * (0.1 * noise) ** 2 / 2 + (2 * bias) ** 2
     denominator = np.mean([np.mean(r**2) for r in references]) + 0.01
     assert true == pytest.approx(known / denominator, rel=0.1)
-    estimate = estimated_flicker(fused[1], fused[0], noisy[1], noisy[0])
+    estimate = estimated_flicker(denoised[1], denoised[0], noisy[1], noisy[0])
     assert estimate == pytest.approx(true, rel=0.15)
 
 
@@ -383,10 +387,10 @@ def test_halves_too_noisy_to_tell_the_flicker_tell_that_of_the_noise():
     noisy, noisy_before = (
         tuple(np.float32(0.5 + 30 * rng.standard_normal(shape)) for _ in "ab") for _ in range(2)
     )
-    fused, before = (
+    denoised, before = (
         tuple(np.float32(0.5 + 0.05 * rng.standard_normal(shape)) for _ in "ab") for _ in range(2)
     )
-    estimate = estimated_flicker(fused, before, noisy, noisy_before)
+    estimate = estimated_flicker(denoised, before, noisy, noisy_before)
     assert estimate == pytest.approx(0.05**2 / (0.5**2 + 0.01), rel=0.1)
 
 
@@ -421,7 +425,7 @@ def test_followed_frames_have_few_pilots_of_their_own(tmp_path, preset, pilots):
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
     assert follower.models.following.layout.pilots == pilots
-    assert follower.models.following.layout.candidate_count == 1
+    assert follower.models.following.layout.extra_count == 1
     assert relmse(followed[1].result.color, frames[1].reference) < 0.3 * relmse(
         frames[1].buffers.color.mean, frames[1].reference
     )
@@ -512,7 +516,7 @@ def test_every_frame_is_denoised_on_the_device_of_the_settings(tmp_path, monkeyp
         return session_from_proto(proto, threads, device)
 
     devices = []
-    for module in (pointwise, inference):
+    for module in (blend_network, inference):
         monkeypatch.setattr(module, "session_from_proto", listed)
     settings = replace(DRAFT, device="cpu", seed=1)
     follower = Follower(settings, refit)

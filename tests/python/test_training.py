@@ -10,9 +10,9 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers.render_buffers import Indices
-from tungsten_dip.fit import FitSettings, denoise, fusion, training
+from tungsten_dip.fit import FitSettings, blending, denoise, training
+from tungsten_dip.fit.blend_network import HIDDEN, BlendNetwork, Examples
 from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.pointwise import HIDDEN, Examples, PointwiseNetwork
 from tungsten_dip.fit.settings import Preset
 from tungsten_dip.fit.training import LEARNING_RATE
 
@@ -21,17 +21,17 @@ def test_the_pixels_that_tell_the_error_are_not_trained_on(
     render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     probed, trained = [], []
-    choices_at, batches = Evidence.choices_at, training._batches
+    candidates_at, batches = Evidence.candidates_at, training._batches
 
     def probed_at(evidence: Evidence, pixels: Indices) -> Any:
         probed.append(pixels)
-        return choices_at(evidence, pixels)
+        return candidates_at(evidence, pixels)
 
     def batches_of(examples: Examples, pixels: Indices, *rest: Any) -> Iterator[Examples]:
         trained.append(pixels)
         return batches(examples, pixels, *rest)
 
-    monkeypatch.setattr(Evidence, "choices_at", probed_at)
+    monkeypatch.setattr(Evidence, "candidates_at", probed_at)
     monkeypatch.setattr(training, "_batches", batches_of)
     denoise(render.buffers, FitSettings("draft", iterations=1, threads=1))
     assert len(probed) == len(trained) == 1
@@ -57,14 +57,14 @@ def test_steps_get_smaller_towards_the_end_of_the_time_budget(
     render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rates: list[float] = []
-    step = PointwiseNetwork.step
+    step = BlendNetwork.step
 
-    def recorded(network: PointwiseNetwork, batch: Examples, learning_rate: float) -> None:
+    def recorded(network: BlendNetwork, batch: Examples, learning_rate: float) -> None:
         rates.append(learning_rate)
         step(network, batch, learning_rate)
 
-    monkeypatch.setattr(PointwiseNetwork, "step", recorded)
-    monkeypatch.setattr(fusion, "Clock", _Clock)
+    monkeypatch.setattr(BlendNetwork, "step", recorded)
+    monkeypatch.setattr(blending, "Clock", _Clock)
     result = denoise(
         render.buffers, FitSettings("draft", iterations=10**6, time_budget_s=1.0, threads=1, device="cpu")
     )

@@ -13,11 +13,11 @@ from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.buffers.render_buffers import FloatArray
 from tungsten_dip.fit import denoise
+from tungsten_dip.fit.blend_network import BlendNetwork, Examples, first_weights, training_step, weight_shapes
 from tungsten_dip.fit.evidence import with_best_baseline
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, loss_weights, network_inputs
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights, training_step, weight_shapes
 from tungsten_dip.fit.training import start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx import infer
@@ -43,13 +43,13 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     batch.target[0] += 1e3
 
     in_torch = TorchNetwork(weights)
-    in_onnx = PointwiseNetwork(weights, len(layout.inputs), layout.choice_count, "cpu")
-    proto = training_step(len(layout.inputs), layout.choice_count)
+    in_onnx = BlendNetwork(weights, len(layout.inputs), layout.candidate_count, "cpu")
+    proto = training_step(len(layout.inputs), layout.candidate_count)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
     feeds = {
         "inputs": batch.inputs,
-        "choices": batch.choices,
+        "candidates": batch.candidates,
         "target": batch.target,
         "weight": batch.weight,
         "weights": vector,
@@ -71,25 +71,23 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
         np.testing.assert_allclose(in_onnx.weights()[name].reshape(value.shape), value, rtol=1e-3, atol=1e-3)
 
 
-def fused(network: PointwiseNetwork, examples: Examples) -> FloatArray:
-    return network.fuse(examples.inputs, examples.choices.swapaxes(0, 1))
+def denoised(network: BlendNetwork, examples: Examples) -> FloatArray:
+    return network.blend(examples.inputs, examples.candidates.swapaxes(0, 1))
 
 
 def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
-    sizes = len(layout.inputs), layout.choice_count
-    together = PointwiseNetwork(weights, *sizes, "cpu", threads=2)
+    sizes = len(layout.inputs), layout.candidate_count
+    together = BlendNetwork(weights, *sizes, "cpu", threads=2)
     parts = {name: np.split(value, 3) for name, value in weights.items()}
-    alone = [
-        PointwiseNetwork({name: part[k] for name, part in parts.items()}, *sizes, "cpu") for k in range(3)
-    ]
+    alone = [BlendNetwork({name: part[k] for name, part in parts.items()}, *sizes, "cpu") for k in range(3)]
     for first in range(0, 300, 100):
         for network in (together, *alone):
             network.step(examples.part(first, first + 100), 1e-2)
-    images = [fused(network, examples) for network in alone]
+    images = [denoised(network, examples) for network in alone]
     assert not np.array_equal(images[0], images[1])
-    np.testing.assert_array_equal(fused(together, examples), sum(images) / np.float32(3))
+    np.testing.assert_array_equal(denoised(together, examples), sum(images) / np.float32(3))
     for name, value in together.weights().items():
         np.testing.assert_array_equal(value, np.concatenate([network.weights()[name] for network in alone]))
 
@@ -98,12 +96,12 @@ def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> Non
 def test_gradients_are_those_of_the_loss(outlier: float) -> None:
     """Against central differences in double precision, without torch."""
     rng = np.random.default_rng(0)
-    inputs, choices, pixels = 3, 2, 5
-    shapes = weight_shapes(inputs, choices)
+    inputs, candidates, pixels = 3, 2, 5
+    shapes = weight_shapes(inputs, candidates)
     vector = rng.normal(0, 0.5, sum(int(np.prod(s)) for s in shapes.values()))
     feeds = {
         "inputs": rng.normal(size=(pixels, inputs)),
-        "choices": rng.random((pixels, choices, 3)),
+        "candidates": rng.random((pixels, candidates, 3)),
         "target": rng.random((pixels, 3)),
         "weight": rng.random((pixels, 1)),
     }
@@ -120,8 +118,8 @@ def test_gradients_are_those_of_the_loss(outlier: float) -> None:
             x = x @ parts[0].T + parts[1]
             x = np.where(x > 0, x, 0.2 * x) if layer < 3 else x
         shares = np.exp(x) / np.exp(x).sum(1, keepdims=True)
-        fused = (shares[:, :, None] * feeds["choices"]).sum(1)
-        error = np.sqrt((feeds["weight"] * (fused - feeds["target"]) ** 2).mean(axis=1))
+        denoised = (shares[:, :, None] * feeds["candidates"]).sum(1)
+        error = np.sqrt((feeds["weight"] * (denoised - feeds["target"]) ** 2).mean(axis=1))
         assert (error > 30).any() == (outlier > 1)
         return float(np.where(error > 30, 60 * error - 900, error**2).mean())
 
@@ -130,7 +128,9 @@ def test_gradients_are_those_of_the_loss(outlier: float) -> None:
     single = {name: value.astype(np.float32) for name, value in {**feeds, "weights": vector}.items()}
     one = np.ones(1, np.float32)
     state = {"mean": zeros, "square": zeros, "learning_rate": one, "step": one}
-    gradient = session_from_proto(training_step(inputs, choices), 1).run(["gradient"], {**single, **state})[0]
+    gradient = session_from_proto(training_step(inputs, candidates), 1).run(
+        ["gradient"], {**single, **state}
+    )[0]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -157,12 +157,12 @@ def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
 
 
 def test_the_network_sees_its_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
-    """Or it would choose a noisy pixel for being dark."""
+    """Or it would prefer a noisy pixel for being dark."""
     evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
     y, x, half = 11, 17, 0
     noisy = [image.copy() for image in evidence.halves]
     noisy[half][y, x] *= 3
-    other = replace(evidence, choices=((noisy[0], noisy[1]), *evidence.choices[1:]))
+    other = replace(evidence, candidates=((noisy[0], noisy[1]), *evidence.candidates[1:]))
     before, after = (np.stack(list(inputs_of_half(e, half)), axis=2) for e in (evidence, other))
     np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
     assert np.abs(after - before).max() > 0.01
@@ -177,7 +177,7 @@ def test_the_network_sees_the_scoring_halfs_noise_of_no_pixel_at_that_pixel(fram
         for x in range(3, 48, 4):
             noisy = evidence.halves[1].copy()
             noisy[y, x] = 5 * noisy[y, x] + 0.1
-            changed = replace(evidence, choices=((evidence.halves[0], noisy), *evidence.choices[1:]))
+            changed = replace(evidence, candidates=((evidence.halves[0], noisy), *evidence.candidates[1:]))
             # As a fit does: the noise is estimated with the same half.
             changed = with_best_baseline(changed)
             assert changed.layout == evidence.layout

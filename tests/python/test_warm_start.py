@@ -20,7 +20,7 @@ from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, denoise, training
-from tungsten_dip.fit.fusion import fit_fusion
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.model import Model
 from tungsten_dip.onnx import infer, load_model, save_model
 from tungsten_dip.progress import silent
@@ -141,8 +141,8 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
             use(without)
     with pytest.raises(InputError, match="fitted with preset draft, this fit is to use balanced"):
         denoise(buffers, replace(DRAFT, preset="balanced"), warm_start=model)
-    with pytest.raises(InputError, match=r"fitted with 0 candidates .*, this input comes with 1"):
-        fit_fusion(buffers, DRAFT, silent, model, previous=(frame.reference, frame.reference))
+    with pytest.raises(InputError, match=r"fitted with 0 extra pilots .*, this input comes with 1"):
+        fit_blend(buffers, DRAFT, silent, model, previous=(frame.reference, frame.reference))
 
     paper = paper_model("skip", buffers)
     with pytest.raises(InputError, match="fitted with preset paper, this fit is to use draft"):
@@ -282,7 +282,7 @@ def test_another_preset_than_the_models_is_named(
 
 def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:
     program = (
-        "from tungsten_dip.fit.pointwise import training_step\n"
+        "from tungsten_dip.fit.blend_network import training_step\n"
         "from tungsten_dip.graphs.sessions import session_from_proto\n"
         "session_from_proto(training_step(2, 2), 1)"
     )

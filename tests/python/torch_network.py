@@ -1,4 +1,4 @@
-"""The pointwise network in plain torch, as an oracle for the one that the fits train with onnxruntime."""
+"""The blend network in plain torch, as an oracle for the one that the fits train with onnxruntime."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tungsten_dip.fit.blend_network import Examples
 from tungsten_dip.fit.model import Weights
-from tungsten_dip.fit.pointwise import Examples
 
 LEAKY_SLOPE = 0.2
 
 
 class TorchNetwork:
-    """Trained like `tungsten_dip.fit.pointwise.PointwiseNetwork`; gradients are autograd's."""
+    """Trained like `tungsten_dip.fit.blend_network.BlendNetwork`; gradients are autograd's."""
 
     def __init__(self, weights: Weights) -> None:
         self._parameters = {
@@ -24,7 +24,7 @@ class TorchNetwork:
 
     def loss(self, batch: Examples) -> Tensor:
         target, weight = torch.from_numpy(batch.target), torch.from_numpy(batch.weight)
-        error = ((self._fused(batch) - target) ** 2 * weight).mean(dim=1).sqrt()
+        error = ((self._blended(batch) - target) ** 2 * weight).mean(dim=1).sqrt()
         return 2 * nn.functional.huber_loss(error, torch.zeros_like(error), delta=30)
 
     def gradients(self, batch: Examples) -> tuple[Tensor, ...]:
@@ -36,17 +36,17 @@ class TorchNetwork:
         self.loss(batch).backward()
         self._adam.step()
 
-    def fuse(self, examples: Examples) -> np.ndarray:
-        return self._fused(examples).detach().numpy()
+    def blend(self, examples: Examples) -> np.ndarray:
+        return self._blended(examples).detach().numpy()
 
     def weights(self) -> dict[str, np.ndarray]:
         return {name: value.detach().numpy() for name, value in self._parameters.items()}
 
-    def _fused(self, examples: Examples) -> Tensor:
+    def _blended(self, examples: Examples) -> Tensor:
         x = torch.from_numpy(examples.inputs)
         for layer in (1, 2, 3):
             weight, bias = (self._parameters[f"layer{layer}.{name}"] for name in ("weight", "bias"))
             x = x @ weight.T + bias
             if layer < 3:
                 x = nn.functional.leaky_relu(x, LEAKY_SLOPE)
-        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.choices)).sum(1)
+        return (x.softmax(1)[:, :, None] * torch.from_numpy(examples.candidates)).sum(1)

@@ -34,7 +34,12 @@ def add_fit_options(
     devices = get_args(get_type_hints(FitSettings)["device"])
     add(f"{flag}preset", dest="preset", choices=presets, help="how to fit (default: balanced)")
     pilots = get_args(get_type_hints(FitSettings)["pilot"])
-    add(f"{flag}pilot", dest="pilot", choices=pilots, help="another denoiser to choose from (default: none)")
+    add(
+        f"{flag}pilot",
+        dest="pilot",
+        choices=pilots,
+        help="another denoiser, whose image is an extra pilot (default: none)",
+    )
     add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=_budget, help="end after 90s, 5m, ...")
     add(f"{flag}target-error", dest="target_error", metavar="E", type=_error, help="end at this relMSE")
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")

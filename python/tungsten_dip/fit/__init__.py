@@ -76,7 +76,7 @@ def denoise(
         result = fit_paper(known.buffers, settings, progress, warm_start)
     else:
         with deferred_interrupts():
-            from tungsten_dip.fit.fusion import fit_fusion
+            from tungsten_dip.fit.blending import fit_blend
 
-        result = fit_fusion(known.buffers, settings, progress, warm_start)
+        result = fit_blend(known.buffers, settings, progress, warm_start)
     return completed(result, known)

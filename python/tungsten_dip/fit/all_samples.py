@@ -18,14 +18,14 @@ _AGREED = 0.25
 """Relative difference of the halves' results from their mean at which all samples get weight 0.5."""
 
 
-def with_all_samples(fused: Halves, all_samples_blend: FloatImage, threads: int) -> FloatImage:
+def with_all_samples(denoised: Halves, all_samples_blend: FloatImage, threads: int) -> FloatImage:
     """Return the mean of both halves' results, moved towards the blended pilots of all samples.
 
     All are linear radiance of shape (height, width, 3). The result moves no further than the halves' results
     differ in the surrounding pixels, and less where they differ strongly.
     """
-    a, b = fused
-    image = mean_of(fused)
+    a, b = denoised
+    image = mean_of(denoised)
     spread = _core.box_mean(channel_mean(np.float32(0.25) * (a - b) ** 2), _SPREAD_RADIUS, threads)
     level = _core.box_mean(channel_mean(image), _SPREAD_RADIUS, threads)
     agreed = (np.float32(_AGREED) * level) ** 2

@@ -60,7 +60,7 @@ def result_without_noise(
 
 def denoised_image(
     evidence: Evidence,
-    fused: Halves,
+    denoised: Halves,
     all_samples_blend: FloatImage | None,
     settings: FitSettings,
     clock: Clock,
@@ -71,12 +71,12 @@ def denoised_image(
     result is that of a network without training (``iterations`` 0), and without its ``model``.
     """
     threads = evidence.threads
-    fused = with_lost_detail(evidence.halves, fused, evidence.halves_drawn)
-    image = mean_of(fused)
+    denoised = with_lost_detail(evidence.halves, denoised, evidence.halves_drawn)
+    image = mean_of(denoised)
     if all_samples_blend is not None:
-        image = with_all_samples(fused, all_samples_blend, threads)
-    pixels = fused[0].reshape(-1, 3), fused[1].reshape(-1, 3)
-    error = estimate_error(evidence.choices, evidence.scale, pixels).reshape(*image.shape[:2], 1)
+        image = with_all_samples(denoised, all_samples_blend, threads)
+    pixels = denoised[0].reshape(-1, 3), denoised[1].reshape(-1, 3)
+    error = estimate_error(evidence.candidates, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
@@ -87,7 +87,7 @@ def denoised_image(
     if estimated >= error_of_input:
         without = "" if evidence.gain is None else " without its fireflies"
         notes = (*notes, f"the input{without} is as good as anything fitted to it, and is returned")
-        image, fused = evidence.mean, evidence.halves
+        image, denoised = evidence.mean, evidence.halves
         epsilon = epsilon_of_renderer(evidence.scale)
         error = bounded_ratio(squared, image**2 + epsilon).mean(axis=2, keepdims=True)
     if evidence.gain is not None:
@@ -99,7 +99,7 @@ def denoised_image(
         iterations=0,
         error=_core.box_mean(error, _ERROR_RADIUS, threads),
         estimated_relmse=float(error.mean(dtype=np.float64)),
-        halves=(unscaled(fused[0], evidence.scale), unscaled(fused[1], evidence.scale)),
+        halves=(unscaled(denoised[0], evidence.scale), unscaled(denoised[1], evidence.scale)),
         gain=evidence.gain,
         halves_drawn=evidence.halves_drawn,
         notes=notes,

@@ -28,23 +28,23 @@ _LARGEST_ERROR = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
-def estimate_error(choices: Sequence[Halves], scale: float, fused: Halves) -> FloatArray:
+def estimate_error(candidates: Sequence[Halves], scale: float, denoised: Halves) -> FloatArray:
     """Estimate the squared error of the mean f of both outputs in each pixel, relative to f^2 + 0.01.
 
-    ``choices`` and ``scale`` are the evidence's, ``fused`` the outputs f_a and f_b for one half each, shape
-    (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f is
-    (f_a - f_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that
-    they differ from f where there is something to blur; but some are far off where the network rightly
-    avoids them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric
-    mean of the variance and the median squared difference of f and the pilots, or less if the noisy halves
-    imply a smaller mean error (see `error_from_halves`).
+    ``candidates`` and ``scale`` are the evidence's, ``denoised`` the outputs f_a and f_b for one half each,
+    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
+    is (f_a - f_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that they
+    differ from f where there is something to blur; but some are far off where the network rightly avoids
+    them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric mean of
+    the variance and the median squared difference of f and the pilots, or less if the noisy halves imply a
+    smaller mean error (see `error_from_halves`).
     """
-    output = mean_of(fused)
+    output = mean_of(denoised)
     epsilon = epsilon_of_renderer(scale)
-    squared = (fused[0] - fused[1]) ** 2 / 4
+    squared = (denoised[0] - denoised[1]) ** 2 / 4
     variance = np.empty(len(output), np.float32)
     bias = np.empty(len(output), np.float32)
-    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in choices[1:]]
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in candidates[1:]]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
         relative = 1 / (output[part] ** 2 + epsilon)
@@ -57,13 +57,13 @@ def estimate_error(choices: Sequence[Halves], scale: float, fused: Halves) -> Fl
             apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
         # The root of each: their product would overflow.
         bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
-    estimated, standard_error = error_from_halves(choices[0], fused, epsilon)
+    estimated, standard_error = error_from_halves(candidates[0], denoised, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
-def held_out_error(choices: Sequence[Halves], fused: Halves) -> float:
+def held_out_error(candidates: Sequence[Halves], denoised: Halves) -> float:
     """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
@@ -71,35 +71,35 @@ def held_out_error(choices: Sequence[Halves], fused: Halves) -> float:
     pilot, far less noisy but a little blurred.
     """
     epsilon = np.float32(RELMSE_EPSILON)
-    for targets in choices[:2]:
-        mean, standard_error = error_from_halves(targets, fused, epsilon)
+    for targets in candidates[:2]:
+        mean, standard_error = error_from_halves(targets, denoised, epsilon)
         if is_sure(mean, standard_error):
             break
-    relative = 1 / (mean_of(fused) ** 2 + epsilon)
-    return max(mean, float(((fused[0] - fused[1]) ** 2 / 4 * relative).mean(dtype=np.float64)))
+    relative = 1 / (mean_of(denoised) ** 2 + epsilon)
+    return max(mean, float(((denoised[0] - denoised[1]) ** 2 / 4 * relative).mean(dtype=np.float64)))
 
 
-def error_from_halves(targets: Halves, fused: Halves, epsilon: np.float32) -> tuple[float, float]:
+def error_from_halves(targets: Halves, denoised: Halves, epsilon: np.float32) -> tuple[float, float]:
     """Return the mean error of the mean of both outputs by independent targets, and its standard error."""
     noisy_a, noisy_b = (image.reshape(-1, 3) for image in targets)
-    of_one, variance = crossed_errors((noisy_a, noisy_b), fused)
-    denominator = mean_of(fused) ** 2 + epsilon
+    of_one, variance = crossed_errors((noisy_a, noisy_b), denoised)
+    denominator = mean_of(denoised) ** 2 + epsilon
     return mean_and_standard_error(channel_mean(bounded_ratio(of_one - variance, denominator)))
 
 
-def crossed_errors(noisy: Halves, fused: Halves) -> tuple[FloatArray, FloatArray]:
+def crossed_errors(noisy: Halves, denoised: Halves) -> tuple[FloatArray, FloatArray]:
     """Return the squared error of one half's result in the mean, and the variance of the mean of both.
 
-    ``noisy`` are independent images a, b of the truth, and ``fused`` the results f_a, f_b of one of them
+    ``noisy`` are independent images a, b of the truth, and ``denoised`` the results f_a, f_b of one of them
     each. The residuals f_a - a and f_b - b are independent, and the mean of each is the bias of a result, so
     that the mean of their product is the squared bias. (f_a - f_b)^2 / 2 is in the mean the variance of one
     result, and half of it that of (f_a + f_b) / 2. Where float32 overflows, either may be infinite, and the
     first NaN.
     """
-    (a, b), (fused_a, fused_b) = noisy, fused
+    (a, b), (denoised_a, denoised_b) = noisy, denoised
     with np.errstate(over="ignore", invalid="ignore"):
-        variance: FloatArray = (fused_a - fused_b) ** 2 / np.float32(4)
-        of_one = (fused_a - a) * (fused_b - b) + 2 * variance
+        variance: FloatArray = (denoised_a - denoised_b) ** 2 / np.float32(4)
+        of_one = (denoised_a - a) * (denoised_b - b) + 2 * variance
     return of_one, variance
 
 

@@ -63,11 +63,11 @@ class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
-    (height, width). ``choices`` holds both halves of the noisy image, of every pilot, of every candidate.
-    ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and the
-    other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a half
-    are relative to. Errors count up to ``caps``, which are made from the half itself, so that neither noise
-    nor scores of a pixel depend on its value in the half that scores it. ``guide_noise`` is that of the
+    (height, width). ``candidates`` holds both halves of the noisy image, of every pilot, of every extra
+    pilot. ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and
+    the other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a
+    half are relative to. Errors count up to ``caps``, which are made from the half itself, so that neither
+    noise nor scores of a pixel depend on its value in the half that scores it. ``guide_noise`` is that of the
     pilots' guides (see `Guides`). ``gain`` is what gives back the radiance of fireflies
     (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
@@ -76,7 +76,7 @@ class Evidence:
     mean: FloatImage
     features: tuple[dict[str, FloatImage], ...]
     layout: Layout
-    choices: tuple[Halves, ...]
+    candidates: tuple[Halves, ...]
     noises: Halves
     denominators: Halves
     caps: Halves
@@ -89,11 +89,11 @@ class Evidence:
     @property
     def halves(self) -> Halves:
         """The noisy halves."""
-        return self.choices[0]
+        return self.candidates[0]
 
-    def choices_at(self, pixels: Indices) -> tuple[Halves, ...]:
-        """Return the choices at some pixels, shape (pixels, 3)."""
-        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.choices)
+    def candidates_at(self, pixels: Indices) -> tuple[Halves, ...]:
+        """Return the candidates at some pixels, shape (pixels, 3)."""
+        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.candidates)
 
     def rows(self, first: int, end: int) -> Evidence:
         """Return the evidence of some rows alone."""
@@ -107,7 +107,7 @@ class Evidence:
             features=tuple(
                 {name: image[first:end] for name, image in features.items()} for features in self.features
             ),
-            choices=tuple(cut(choice) for choice in self.choices),
+            candidates=tuple(cut(candidate) for candidate in self.candidates),
             noises=cut(self.noises),
             denominators=cut(self.denominators),
             caps=cut(self.caps),
@@ -119,19 +119,19 @@ class Evidence:
 def evidence_from_buffers(
     image: HalvedImage,
     settings: FitSettings,
-    chosen: Layout | Sequence[Pilot],
+    plan: Layout | Sequence[Pilot],
     clock: Clock,
     progress: Progress,
     previous: Halves | None,
 ) -> Evidence:
     """Compute the pilots of an image, as many as the time budget lets begin (one at least).
 
-    ``chosen`` are the pilots, or the layout of a fitted network, whose pilots are all computed. ``previous``
-    is a candidate, NaN where it has no value, that guides the pilots as well.
+    ``plan`` is the pilots, or the layout of a fitted network, whose pilots are all computed. ``previous``
+    is an extra pilot, NaN where it has no value, that guides the pilots as well.
 
-    Raises InputError if the layout has a feature that is missing or another number of candidates.
+    Raises InputError if the layout has a feature that is missing or another number of extra pilots.
     """
-    layout, pilots = (chosen, chosen.pilots) if isinstance(chosen, Layout) else (None, chosen)
+    layout, pilots = (plan, plan.pilots) if isinstance(plan, Layout) else (None, plan)
     buffers = image.buffers
     threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
@@ -139,13 +139,13 @@ def evidence_from_buffers(
     halves = limited.halves
     surfaces = surfaces_of_halves(buffers, halves, scale, threads)
     progress(0.1, "features")
-    candidates: list[Halves] = []
+    extra_pilots: list[Halves] = []
     if settings.pilot == "oidn":
         a, b = oidn_pilot(buffers, halves, scale, threads)
-        candidates.append((a, b))
+        extra_pilots.append((a, b))
         progress(0.15, "Open Image Denoise")
     if layout is not None:
-        _check_fits(layout, surfaces[0], len(candidates) + (previous is not None))
+        _check_fits(layout, surfaces[0], len(extra_pilots) + (previous is not None))
 
     occupied = _occupied(halves, buffers, threads)
     guides, known, filled = _guides(halves, surfaces, previous, scale, occupied)
@@ -153,15 +153,15 @@ def evidence_from_buffers(
     budget = clock if layout is None else Clock()
     computed = _computed(maker, pilots, known, occupied, budget, progress)
     if filled is not None:
-        candidates.append(filled)
+        extra_pilots.append(filled)
 
-    choices = (halves, *computed, *candidates)
+    candidates = (halves, *computed, *extra_pilots)
     denominators = _denominators(computed)
     if layout is None:
-        baseline = _best(choices, denominators)
-        layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(candidates), baseline)
-    caps = _caps(choices, denominators, threads)
-    noises = _noises(_errors(choices[layout.baseline], halves, denominators), caps, threads)
+        baseline = _best(candidates, denominators)
+        layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(extra_pilots), baseline)
+    caps = _caps(candidates, denominators, threads)
+    noises = _noises(_errors(candidates[layout.baseline], halves, denominators), caps, threads)
     features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
     notes = (*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes)
     return Evidence(
@@ -169,7 +169,7 @@ def evidence_from_buffers(
         mean=mean,
         features=features,
         layout=layout,
-        choices=choices,
+        candidates=candidates,
         noises=noises,
         denominators=denominators,
         caps=caps,
@@ -247,9 +247,9 @@ def pilots_of_all_samples(
 ) -> tuple[FloatImage, ...]:
     """Return the pilots of all samples, with less noisy features and guides than a half's.
 
-    One image for each of ``evidence.choices``, in the units of the evidence, shape (height, width, 3). None
-    at all where the pilots of the halves have used up their share of the time budget, or once ``given_up`` is
-    set.
+    One image for each of ``evidence.candidates``, in the units of the evidence, shape (height, width, 3).
+    None at all where the pilots of the halves have used up their share of the time budget, or once
+    ``given_up`` is set.
     """
     if clock.share_spent() > _PILOTS_SHARE:
         return ()
@@ -273,30 +273,31 @@ def pilots_of_all_samples(
 
 def with_best_baseline(evidence: Evidence) -> Evidence:
     """Return the same evidence with the pilot that is best on this image as the baseline."""
-    choices, denominators = evidence.choices, evidence.denominators
-    baseline = _best(choices, denominators)
-    errors = _errors(choices[baseline], evidence.halves, denominators)
+    candidates, denominators = evidence.candidates, evidence.denominators
+    baseline = _best(candidates, denominators)
+    errors = _errors(candidates[baseline], evidence.halves, denominators)
     noises = _noises(errors, evidence.caps, evidence.threads)
     return replace(evidence, layout=replace(evidence.layout, baseline=baseline), noises=noises)
 
 
-def _best(choices: Sequence[Halves], denominators: Halves) -> int:
-    """Return the index of the choice with the least error; the noisy halves, the first, do not count."""
+def _best(candidates: Sequence[Halves], denominators: Halves) -> int:
+    """Return the index of the candidate with the least error; the noisy halves, the first, do not count."""
     mean_errors = [
-        sum(float(np.minimum(error, 1).mean()) for error in _errors(choice, choices[0], denominators))
-        for choice in choices[1:]
+        sum(float(np.minimum(error, 1).mean()) for error in _errors(candidate, candidates[0], denominators))
+        for candidate in candidates[1:]
     ]
     return 1 + int(np.argmin(mean_errors))
 
 
-def _caps(choices: Sequence[Halves], denominators: Halves, threads: int) -> Halves:
-    """Return `Evidence.caps`, from the mean error of each half's choices by that half itself."""
+def _caps(candidates: Sequence[Halves], denominators: Halves, threads: int) -> Halves:
+    """Return `Evidence.caps`, from the mean error of each half's candidates by that half itself."""
 
     def cap(half: int) -> FloatImage:
         errors = (
-            relative_error(choice[half], choices[0][half], denominators[half]) for choice in choices[1:]
+            relative_error(candidate[half], candidates[0][half], denominators[half])
+            for candidate in candidates[1:]
         )
-        mean = sum(errors, np.zeros_like(denominators[half])) / np.float32(len(choices) - 1)
+        mean = sum(errors, np.zeros_like(denominators[half])) / np.float32(len(candidates) - 1)
         around = _core.box_mean(mean, _NOISE_RADIUS, threads)
         return np.float32(_OUTLIER) * around + np.float32(_LEAST_CAP)
 
@@ -313,17 +314,17 @@ def _noises(errors_of_baseline: Halves, caps: Halves, threads: int) -> Halves:
     return a, b
 
 
-def _check_fits(layout: Layout, surfaces: Surfaces, candidate_count: int) -> None:
+def _check_fits(layout: Layout, surfaces: Surfaces, extra_count: int) -> None:
     unknown = [n for n in layout.features if n not in surfaces.names and n not in surfaces.left_out]
     if unknown:
         raise InputError(
             f"the model was fitted with {', '.join(unknown)}, which this input does not have; render it, or "
             f"fit without the model"
         )
-    if layout.candidate_count != candidate_count:
+    if layout.extra_count != extra_count:
         raise InputError(
-            f"the model was fitted with {layout.candidate_count} candidates (Open Image Denoise's image, the "
-            f"previous frame), this input comes with {candidate_count}; fit without the model"
+            f"the model was fitted with {layout.extra_count} extra pilots (Open Image Denoise's image, the "
+            f"previous frame), this input comes with {extra_count}; fit without the model"
         )
 
 

@@ -67,23 +67,23 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
         yield evidence.features[half][name]
     noise = evidence.noises[half]
     yield np.log(noise + np.float32(_LEAST_ERROR))[:, :, 0]
-    base = _log_level(evidence.choices[layout.baseline][half])
+    base = _log_level(evidence.candidates[layout.baseline][half])
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
     denominator = evidence.denominators[half]
     unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
     cap = evidence.caps[half]
-    baseline = np.minimum(relative_error(evidence.choices[layout.baseline][half], other, denominator), cap)
-    for index, choice in enumerate(evidence.choices):
+    baseline = np.minimum(relative_error(evidence.candidates[layout.baseline][half], other, denominator), cap)
+    for index, candidate in enumerate(evidence.candidates):
         if index == layout.baseline:
             continue
-        image = choice[half]
+        image = candidate[half]
         if index == 0:
-            # Without the pixel's own noise: else a noisy pixel is chosen for being dark by chance.
+            # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
             image = np.maximum(mean_around(image, 1, threads), 0)
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
-        worse = np.minimum(relative_error(choice[half], other, denominator), cap) - baseline
+        worse = np.minimum(relative_error(candidate[half], other, denominator), cap) - baseline
         for radius in SCORE_RADII:
             score = mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]

@@ -1,4 +1,4 @@
-"""What a network sees and chooses among: the part of a fit that is saved with it."""
+"""What a network sees and what it blends: the part of a fit that is saved with it."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ class Pilot:
 
 @dataclass(frozen=True)
 class Layout:
-    """The inputs of a network and the images it chooses among: the same for every image that it is used on.
+    """The inputs of a network and the candidates it blends: the same for every image that it is used on.
 
-    ``features`` names channels of the features. The images are the noisy one, then the ``pilots`` that
-    filters compute, then the candidates: Open Image Denoise's image, the previous frame.
-    ``baseline`` is the index of the pilot that the others are compared with.
+    ``features`` names channels of the features. The candidates are the noisy image, then the ``pilots`` that
+    our filters compute, then ``extra_count`` extra pilots: Open Image Denoise's image, the previous frame.
+    ``baseline`` is the index of the candidate that the others are compared with, never the noisy image.
     """
 
     features: tuple[str, ...]
     pilots: tuple[Pilot, ...]
-    candidate_count: int
+    extra_count: int
     baseline: int
 
     @property
-    def choice_count(self) -> int:
-        """How many images the network chooses among."""
-        return 1 + len(self.pilots) + self.candidate_count
+    def candidate_count(self) -> int:
+        """How many images the network blends."""
+        return 1 + len(self.pilots) + self.extra_count
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -54,8 +54,8 @@ class Layout:
             "noise",
             "level",
             *(
-                f"choice {index} {what}"
-                for index in range(self.choice_count)
+                f"candidate {index} {what}"
+                for index in range(self.candidate_count)
                 if index != self.baseline
                 for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
             ),

@@ -29,10 +29,10 @@ _BLACK = 2e-3
 """Levels below are compared as black; the median of lit pixels is about 0.25."""
 
 
-def with_lost_detail(halves: Halves, fused: Halves, drawn: bool = False) -> Halves:
+def with_lost_detail(halves: Halves, denoised: Halves, drawn: bool = False) -> Halves:
     """Add detail back to each half's image that its noisy half contains and the other half confirms.
 
-    ``halves`` are the noisy halves and ``fused`` the denoised ones, both linear and in the units of
+    ``halves`` are the noisy halves and ``denoised`` the denoised ones, both linear and in the units of
     `evidence.Evidence`, shape (height, width, 3). With f a half's result, a its noisy half, b the other one
     and d = f^2 + 0.01, over all pixels in which a and f differ by some factor and more
 
@@ -44,14 +44,14 @@ def with_lost_detail(halves: Halves, fused: Halves, drawn: bool = False) -> Halv
     from the image, only what is brighter is added: a pixel that no sample lit is 0 in both of its parts,
     which therefore confirm nothing.
     """
-    octaves = [np.log2(_level(noisy) / _level(image)) for noisy, image in zip(halves, fused, strict=True)]
-    given = [image.copy() for image in fused]
+    octaves = [np.log2(_level(noisy) / _level(image)) for noisy, image in zip(halves, denoised, strict=True)]
+    given = [image.copy() for image in denoised]
     for side in (1,) if drawn else (-1, 1):
         places = [np.nonzero(side * o >= _OCTAVES[1]) for o in octaves]
         octaves_apart = [side * o[place] for o, place in zip(octaves, places, strict=True)]
         products, squares = [], []
         for half, place in enumerate(places):
-            image = fused[half][place].astype(np.float64)
+            image = denoised[half][place].astype(np.float64)
             own, other = halves[half][place] - image, halves[1 - half][place] - image
             denominator = image.mean(axis=1) ** 2 + RELMSE_EPSILON
             products.append((own * other).mean(axis=1) / denominator)
@@ -59,7 +59,7 @@ def with_lost_detail(halves: Halves, fused: Halves, drawn: bool = False) -> Halv
         slopes = _sure_slopes(*(np.concatenate(values) for values in (octaves_apart, products, squares)))
         for half, place in enumerate(places):
             share = np.interp(octaves_apart[half], _OCTAVES, slopes).astype(np.float32)[:, None]
-            given[half][place] += share * (halves[half][place] - fused[half][place])
+            given[half][place] += share * (halves[half][place] - denoised[half][place])
     return given[0], given[1]
 
 

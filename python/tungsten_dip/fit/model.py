@@ -24,7 +24,7 @@ Weights = dict[str, npt.NDArray[np.float32]]
 class Model:
     """A fitted network and all that is needed to use it on another image.
 
-    That of the presets draft, balanced and final chooses pixel by pixel among the pilots of ``layout``, and
+    That of the presets draft, balanced and final blends, pixel by pixel, the candidates of ``layout``, and
     its inputs are standardised with constants of the image that it was fitted to. The networks of the preset
     paper give the image themselves; for them ``layout`` and ``standardisation`` are None.
 
@@ -48,9 +48,9 @@ class Model:
         object.__setattr__(self, "settings", FitSettings(**kept))
 
     @property
-    def kind(self) -> Literal["pointwise", "skip", "resnet"]:
+    def kind(self) -> Literal["blend", "skip", "resnet"]:
         """What network it is."""
-        return self.settings.network if self.settings.preset == "paper" else "pointwise"
+        return self.settings.network if self.settings.preset == "paper" else "blend"
 
 
 def source_sha256(buffers: RenderBuffers) -> str:

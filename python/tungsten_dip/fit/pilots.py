@@ -1,4 +1,4 @@
-"""Pilots: closed-form estimates of the clean image, among which a network later chooses pixel by pixel.
+"""Pilots: closed-form estimates of the clean image, which a network later blends pixel by pixel.
 
 A pilot is a local first-order regression of the demodulated colour on the features (`_core.regress`), in a
 window of its own, or the mean of the colour along their edges (`_core.smooth_along_edges`), or it uses the

@@ -32,8 +32,8 @@ _MOST_CHANNELS = 4096
 class FitSettings:
     """Settings of one fit.
 
-    ``pilot`` names a pre-trained denoiser whose image is one more pilot, a candidate that the halves score
-    like the others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and
+    ``pilot`` names a pre-trained denoiser whose image is an extra pilot, which the halves score like the
+    others: Open Image Denoise, of the extra ``oidn``. ``network``, ``inputs``, ``scheme`` and
     ``channels`` describe the network of the published method and are used by the preset ``paper`` alone.
     ``channels`` may be a list, too. ``target_error`` is a relMSE (epsilon 0.01). ``iterations`` None
     means: as the preset has it. ``threads`` None uses every core. A time or an error that is None does not

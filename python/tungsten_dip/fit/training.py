@@ -1,4 +1,4 @@
-"""How the network that chooses among pilots is trained: on what, how long, and from which weights."""
+"""How the network that blends pilots is trained: on what, how long, and from which weights."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from tungsten_dip.buffers.render_buffers import FloatArray, Halves, Indices
 from tungsten_dip.cores import in_pair
+from tungsten_dip.fit.blend_network import BlendNetwork, Examples, first_weights
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.error import estimate_error, held_out_error
 from tungsten_dip.fit.evidence import Evidence, with_best_baseline
@@ -18,7 +19,6 @@ from tungsten_dip.fit.inputs import (
     network_inputs,
 )
 from tungsten_dip.fit.model import Model, Weights
-from tungsten_dip.fit.pointwise import Examples, PointwiseNetwork, first_weights
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.standardisation import LARGEST_INPUT, Standardisation, standardisation_of
@@ -70,7 +70,7 @@ class Start:
 def start_of_training(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
     """Return the examples, and the weights of ``model`` or, if its image was too different, new ones.
 
-    New weights are those of so many ``members`` (`fit.pointwise`).
+    New weights are those of so many ``members`` (`fit.blend_network`).
     """
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()
@@ -98,20 +98,20 @@ def _start(
 ) -> Start:
     """Return the start with its examples; its evidence holds no second copy of what they hold."""
     pixels = inputs.shape[1]
-    choices = np.empty((2, pixels, len(evidence.choices), 3), np.float32)
+    candidates = np.empty((2, pixels, len(evidence.candidates), 3), np.float32)
 
     def fill(half: int) -> None:
-        for index, choice in enumerate(evidence.choices):
-            choices[half, :, index] = choice[half].reshape(pixels, 3)
+        for index, candidate in enumerate(evidence.candidates):
+            candidates[half, :, index] = candidate[half].reshape(pixels, 3)
 
     in_pair(fill, evidence.threads)
     target = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
     weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
     # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
-    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in choices.transpose(2, 0, 1, 3))
-    examples = Examples(inputs.reshape(2 * pixels, -1), choices.reshape(2 * pixels, -1, 3), target, weight)
-    evidence = replace(evidence, choices=views, features=({}, {}))
+    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in candidates.transpose(2, 0, 1, 3))
+    examples = Examples(inputs.reshape(2 * pixels, -1), candidates.reshape(2 * pixels, -1, 3), target, weight)
+    evidence = replace(evidence, candidates=views, features=({}, {}))
     return Start(evidence, examples, standardisation, weights, warm, notes)
 
 
@@ -133,22 +133,24 @@ def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Gen
 
 @dataclass(frozen=True)
 class _Probe:
-    """Pixels by which a training is judged: what is chosen among there, and the examples of each half."""
+    """Pixels by which a training is judged: the candidates there, and the examples of each half."""
 
-    choices: tuple[Halves, ...]
+    candidates: tuple[Halves, ...]
     examples: tuple[Examples, Examples]
     scale: float
     threads: int
 
-    def errors(self, network: PointwiseNetwork) -> tuple[float, float]:
+    def errors(self, network: BlendNetwork) -> tuple[float, float]:
         """Return the estimated error, and the error on the other half."""
 
         def of_half(half: int) -> FloatArray:
-            return network.fuse(self.examples[half].inputs, [choice[half] for choice in self.choices])
+            return network.blend(
+                self.examples[half].inputs, [candidate[half] for candidate in self.candidates]
+            )
 
-        fused = in_pair(of_half, self.threads)
-        errors = estimate_error(self.choices, self.scale, fused)
-        return float(errors.mean(dtype=np.float64)), held_out_error(self.choices, fused)
+        denoised = in_pair(of_half, self.threads)
+        errors = estimate_error(self.candidates, self.scale, denoised)
+        return float(errors.mean(dtype=np.float64)), held_out_error(self.candidates, denoised)
 
 
 def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
@@ -159,7 +161,7 @@ def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
     probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
     evidence, examples = start.evidence, start.examples
     of_halves = examples.of_half(0).at(probe), examples.of_half(1).at(probe)
-    return _Probe(evidence.choices_at(probe), of_halves, evidence.scale, evidence.threads), trained
+    return _Probe(evidence.candidates_at(probe), of_halves, evidence.scale, evidence.threads), trained
 
 
 @dataclass
@@ -180,7 +182,7 @@ class _EarlyStopping:
     weights: Weights
     _since_gain: int = 0
 
-    def record(self, step: int, error: float, network: PointwiseNetwork) -> None:
+    def record(self, step: int, error: float, network: BlendNetwork) -> None:
         """Take note of the error that the network has now. The first step is too small to tell of a gain."""
         if step > 1:
             self._since_gain = 0 if error < (1 - _WARM_GAIN) * self.error else self._since_gain + 1
@@ -194,7 +196,7 @@ class _EarlyStopping:
 
 
 def train(
-    network: PointwiseNetwork,
+    network: BlendNetwork,
     start: Start,
     settings: FitSettings,
     steps: int,

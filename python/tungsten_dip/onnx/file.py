@@ -34,7 +34,7 @@ LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
 """Of all but the weights: bounds the memory of the parser."""
 
-_FORMAT = 7
+_FORMAT = 8
 """Raised whenever another graph is written, or the same one has other inputs."""
 
 _PROPERTY = "tungsten_dip"
@@ -43,7 +43,7 @@ _NO_ONNX = "expected an ONNX model, found another file or a truncated one; save 
 _MOST_PARTS = 1 << 16
 _LARGEST_COUNT = 1 << 16
 _LARGEST_RADIUS = 64
-_MOST_CHOICES = 64
+_MOST_CANDIDATES = 64
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -103,7 +103,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         facts["layout"] = {
             "features": model.layout.features,
             "pilots": [asdict(pilot) for pilot in model.layout.pilots],
-            "candidates": model.layout.candidate_count,
+            "extra_pilots": model.layout.extra_count,
             "baseline": model.layout.baseline,
         }
     return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
@@ -243,11 +243,11 @@ def _layout(facts: dict[str, Any]) -> Layout:
         if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
             raise InputError("pilots: expected k from 0.01 to 100")
     features = _checked("features", facts.get("features"), tuple[str, ...])
-    candidate_count, baseline = (_checked(n, facts.get(n), int) for n in ("candidates", "baseline"))
-    layout = Layout(features, tuple(pilots), candidate_count, baseline)
-    if not pilots or layout.choice_count > _MOST_CHOICES or not 0 < baseline < layout.choice_count:
+    extra_count, baseline = (_checked(n, facts.get(n), int) for n in ("extra_pilots", "baseline"))
+    layout = Layout(features, tuple(pilots), extra_count, baseline)
+    if not pilots or layout.candidate_count > _MOST_CANDIDATES or not 0 < baseline < layout.candidate_count:
         raise InputError(
-            f"layout: expected one pilot or more, and at most {_MOST_CHOICES} images to choose from"
+            f"layout: expected one pilot or more, and at most {_MOST_CANDIDATES} images to blend"
         )
     return layout
 

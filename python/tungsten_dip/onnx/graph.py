@@ -1,4 +1,4 @@
-"""The graphs of the networks: what `fit.pointwise` and `fit.paper.networks` compute, in plain operators.
+"""The graphs of the networks: what `fit.blend_network` and `fit.paper.networks` compute, in plain operators.
 
 The height and width of the inputs are free. The images of a batch are independent: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
@@ -14,6 +14,8 @@ import onnx
 from onnx import TensorProto
 
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit.blend_network import HIDDEN, members_of
+from tungsten_dip.fit.blend_network import LEAKY_SLOPE as BLEND_SLOPE
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.paper.constants import (
     LEAKY_SLOPE,
@@ -23,19 +25,17 @@ from tungsten_dip.fit.paper.constants import (
     SIDE_CHANNELS,
     SIDE_SCALES,
 )
-from tungsten_dip.fit.pointwise import HIDDEN, members_of
-from tungsten_dip.fit.pointwise import LEAKY_SLOPE as POINTWISE_SLOPE
 from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
 _MOST_MEMBERS = 16
-"""Of a pointwise network: the memory that it takes grows with them."""
+"""Of a blend network: the memory that it takes grows with them."""
 
 
 def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.ModelProto:
     """Return the model's network with its weights.
 
-    Pointwise: ``inputs`` (N, inputs, H, W), as they come, and ``choices`` (N, choices, 3, H, W) give
+    Kind blend: ``inputs`` (N, inputs, H, W), as they come, and ``candidates`` (N, candidates, 3, H, W) give
     ``color`` (N, 3, H, W). Others: ``inputs`` (N, inputs, H, W) give ``color`` (N, outputs, H, W), colour
     first.
 
@@ -46,11 +46,11 @@ def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.Model
     shapes: dict[str, tuple[int | str, ...]] = {"inputs": ("N", inputs, "H", "W")}
     outputs = 3
     if model.layout is not None and model.standardisation is not None:
-        shapes["choices"] = ("N", model.layout.choice_count, 3, "H", "W")
+        shapes["candidates"] = ("N", model.layout.candidate_count, 3, "H", "W")
         mean, std = model.standardisation.mean, model.standardisation.std
         if not mean.shape == std.shape == (inputs,):
             raise InputError(f"the model has constants for {mean.size} inputs, and {inputs} inputs")
-        build.pointwise(inputs, model.layout.choice_count, mean, std)
+        build.blend(inputs, model.layout.candidate_count, mean, std)
     else:
         name = "head.bias" if model.kind == "skip" else "last.bias"
         outputs = model.weights[name].size if name in model.weights else 3
@@ -72,10 +72,10 @@ class _Network(GraphBuilder):
         self._weights = weights
         self._used: set[str] = set()
 
-    def pointwise(
-        self, inputs: int, choices: int, mean: npt.NDArray[np.float64], std: npt.NDArray[np.float32]
+    def blend(
+        self, inputs: int, candidates: int, mean: npt.NDArray[np.float64], std: npt.NDArray[np.float32]
     ) -> None:
-        """Standardise, weigh the choices, blend them."""
+        """Standardise, compute the candidates' weights, blend them."""
         # In double precision, as in the fit: an input may vary by little around a large mean.
         exact = self.add("Cast", "inputs", to=TensorProto.DOUBLE)
         centred = self.add("Sub", exact, self.constant("mean", mean.reshape(-1, 1, 1)))
@@ -86,16 +86,16 @@ class _Network(GraphBuilder):
         if members > _MOST_MEMBERS:
             raise InputError(f"the model has {members} members: expected at most {_MOST_MEMBERS}")
         hidden = members * HIDDEN
-        x = self.leaky(self.conv(x, "layer1", inputs, hidden), POINTWISE_SLOPE)
-        x = self.leaky(self.conv(x, "layer2", hidden, hidden, groups=members), POINTWISE_SLOPE)
-        x = self.conv(x, "layer3", hidden, members * choices, groups=members)
+        x = self.leaky(self.conv(x, "layer1", inputs, hidden), BLEND_SLOPE)
+        x = self.leaky(self.conv(x, "layer2", hidden, hidden, groups=members), BLEND_SLOPE)
+        x = self.conv(x, "layer3", hidden, members * candidates, groups=members)
         if members == 1:
             x = self.add("Softmax", x, axis=1)
         else:
-            parts = self.split(x, [choices] * members, axis=1)
+            parts = self.split(x, [candidates] * members, axis=1)
             x = self.add("Mean", *(self.add("Softmax", part, axis=1) for part in parts))
-        mixed = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "choices")
-        self.add("ReduceSum", mixed, self.integers(1), keepdims=0, output="color")
+        weighted = self.add("Mul", self.add("Unsqueeze", x, self.integers(2)), "candidates")
+        self.add("ReduceSum", weighted, self.integers(1), keepdims=0, output="color")
 
     def skip(self, inputs: int, outputs: int, channels: tuple[int, ...]) -> None:
         """Encoder and decoder, as `tungsten_dip.fit.paper.networks.Skip`."""

@@ -12,14 +12,14 @@ from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffer
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import check_ready
+from tungsten_dip.fit.blend_network import BlendNetwork
+from tungsten_dip.fit.blending import blended_images, blends_all_samples, fit_blend
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.fusion import blends_all_samples, fit_fusion, fused_images
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
-from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
@@ -42,7 +42,7 @@ def infer(
     """Denoise one image with a fitted network, by onnxruntime alone.
 
     ``buffers`` are as in `tungsten_dip.denoise`, with the features of the fit. ``threads`` None uses every
-    core. With ``refit_steps``, a pointwise network is first trained further on this image, as by a warm
+    core. With ``refit_steps``, a blend network is first trained further on this image, as by a warm
     start, for so many steps at most; the result's ``model`` is then the refined one. An image too unlike the
     model's gets a new network instead, with all the steps of a fit. A network of the preset paper outputs the
     image itself, and its error is not estimated.
@@ -56,9 +56,9 @@ def infer(
     if model.layout is None:
         result = _infer_paper(model, known.buffers, settings, progress)
     elif refit_steps:
-        result = fit_fusion(known.buffers, settings, progress, model, refit_steps=refit_steps)
+        result = fit_blend(known.buffers, settings, progress, model, refit_steps=refit_steps)
     else:
-        result = infer_fusion(model, known.buffers, settings, progress)
+        result = infer_blend(model, known.buffers, settings, progress)
     return completed(result, known)
 
 
@@ -78,16 +78,16 @@ def inference_settings(model: Model, threads: int | None, refit_steps: int) -> F
     return settings
 
 
-def infer_fusion(
+def infer_blend(
     model: Model,
     buffers: RenderBuffers,
     settings: FitSettings,
     progress: Progress,
     previous: Halves | None = None,
 ) -> FitResult:
-    """Denoise sanitised buffers with a pointwise network, on the device of the settings; see `infer`.
+    """Denoise sanitised buffers with a blend network, on the device of the settings; see `infer`.
 
-    ``previous`` is as in `tungsten_dip.fit.fusion.fit_fusion`.
+    ``previous`` is as in `tungsten_dip.fit.blending.fit_blend`.
     """
     clock = Clock()
     assert model.layout is not None
@@ -99,19 +99,19 @@ def infer_fusion(
     all_samples_pilots: tuple[FloatImage, ...] = ()
     if blends_all_samples(settings, following=previous is not None):
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
-    fused, all_samples_blend = _fused(model, evidence, all_samples_pilots, settings.device)
-    result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
+    denoised, all_samples_blend = _blended(model, evidence, all_samples_pilots, settings.device)
+    result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)
     progress(1.0, "inferred")
     return replace(result, model=model)
 
 
-def _fused(
+def _blended(
     model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage], device: Device
 ) -> tuple[Halves, FloatImage | None]:
-    """Return what `fused_images` does, computed band by band: the inputs of a large image need gigabytes."""
+    """Return what `blended_images` does, band by band: the inputs of a large image need gigabytes."""
     assert model.standardisation is not None
     layout, threads = evidence.layout, evidence.threads
-    network = PointwiseNetwork(model.weights, len(layout.inputs), layout.choice_count, device, threads)
+    network = BlendNetwork(model.weights, len(layout.inputs), layout.candidate_count, device, threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     bands = []
@@ -124,7 +124,7 @@ def _fused(
         ]
         model.standardisation.apply(inputs, threads)
         pilots = [pilot[first:end] for pilot in all_samples_pilots]
-        bands.append(fused_images(network, inputs, evidence.rows(first, end), pilots))
+        bands.append(blended_images(network, inputs, evidence.rows(first, end), pilots))
     halves, blends = zip(*bands, strict=True)
     a, b = (np.concatenate(images) for images in zip(*halves, strict=True))
     return (a, b), np.concatenate(blends) if all_samples_pilots else None

@@ -26,11 +26,11 @@ def flicker(
     return float(np.mean(error.astype(np.float64) ** 2 / _denominator(reference, previous_reference)))
 
 
-def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_noisy: Halves) -> float:
+def estimated_flicker(denoised: Halves, previous: Halves, noisy: Halves, previous_noisy: Halves) -> float:
     """Return the flicker without a reference, from halves A and B of both frames.
 
-    ``fused`` and ``previous`` are what was made of the halves ``noisy`` and ``previous_noisy``, each of its
-    own half alone, through all frames. The change from frame to frame of one half's result is then
+    ``denoised`` and ``previous`` are what was made of the halves ``noisy`` and ``previous_noisy``, each of
+    its own half alone, through all frames. The change from frame to frame of one half's result is then
     independent of the noise of the other half's change, and the error of the change is estimated as that of
     an image (`crossed_errors`).
 
@@ -38,10 +38,10 @@ def estimated_flicker(fused: Halves, previous: Halves, noisy: Halves, previous_n
     change is returned. It is the part of the flicker that is noise, and lacks what the results of both halves
     have in common.
     """
-    d_fused, d_noisy = _change(fused, previous), _change(noisy, previous_noisy)
+    d_denoised, d_noisy = _change(denoised, previous), _change(noisy, previous_noisy)
     with np.errstate(over="ignore", invalid="ignore"):
-        denominator = _denominator(mean_of(fused), mean_of(previous))
-        of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_fused))
+        denominator = _denominator(mean_of(denoised), mean_of(previous))
+        of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_denoised))
         mean, standard_error = mean_and_standard_error(of_one - variance)
     return mean if is_sure(mean, standard_error) else float(variance.mean(dtype=np.float64))
 

@@ -1,7 +1,7 @@
 """One frame after another: the first is fitted, the others start from its network and from the frame before.
 
 Where the cameras are known, what the previous frame's result shows of the next is moved into place and guides
-it (`reprojection`): then few pilots are enough, a network of its own chooses among them, and noise averages
+it (`reprojection`): then few pilots are enough, a network of its own blends them, and noise averages
 out over the frames. Otherwise a frame has the first one's pilots, and starts from its network. A cut is
 detected by the features (little of the previous frame is in sight) or by the error, and fitted anew.
 """
@@ -19,13 +19,13 @@ from tungsten_dip.buffers.render_buffers import FEATURES, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
-from tungsten_dip.fit.fusion import fit_fusion
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.preparation import completed, prepared
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.surfaces import alpha_as_albedo
-from tungsten_dip.onnx.inference import infer_fusion
+from tungsten_dip.onnx.inference import infer_blend
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker
@@ -38,7 +38,7 @@ How = Literal["fitted", "followed", "cut"]
 
 _MOST_STEPS = 240
 """Of a network that is trained further, and of a new one for frames that follow: as many as one network by
-itself needs (`fit.fusion`)."""
+itself needs (`fit.blending`)."""
 
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
@@ -129,7 +129,7 @@ class Follower:
             _LOG.info("a cut: %s", cut)
             how, followed = "cut", None
         if followed is None:
-            followed = Followed(fit_fusion(buffers, self._settings, progress), how)
+            followed = Followed(fit_blend(buffers, self._settings, progress), how)
         result = followed.result
         if followed.how != "followed":
             # A network for frames that follow was fitted to what came before the cut.
@@ -179,11 +179,11 @@ class Follower:
         steps = _MOST_STEPS if self._refit == "auto" else self._refit
         try:
             if model is not None and steps == 0:
-                result = infer_fusion(model, buffers, self._settings, progress, previous=moved)
+                result = infer_blend(model, buffers, self._settings, progress, previous=moved)
             else:
                 of_new = self._settings.iterations if moved is None else _MOST_STEPS
                 settings = replace(self._settings, iterations=of_new)
-                result = fit_fusion(buffers, settings, progress, model, moved, refit_steps=steps)
+                result = fit_blend(buffers, settings, progress, model, moved, refit_steps=steps)
         except InputError as problem:
             if last is None:
                 raise  # The model was made for something else.

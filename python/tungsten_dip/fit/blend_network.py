@@ -1,4 +1,4 @@
-"""The network that chooses among pilots, pixel by pixel, and its training.
+"""The network that blends pilots, pixel by pixel, and its training.
 
 It may be several networks of one shape, its members, that start from different weights and use the same
 examples; the error of their mean is below that of each.
@@ -45,12 +45,12 @@ _RUN_PIXELS = 1 << 14
 class Examples:
     """What a network is trained on: pixels of an image, those of half A first, or some of them.
 
-    ``inputs`` has shape (pixels, inputs), ``choices`` (pixels, choices, 3), ``target``, the other half's
-    colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
+    ``inputs`` has shape (pixels, inputs), ``candidates`` (pixels, candidates, 3), ``target``, the other
+    half's colour, (pixels, 3), and ``weight``, of the squared error, (pixels, 1).
     """
 
     inputs: FloatArray
-    choices: FloatArray
+    candidates: FloatArray
     target: FloatArray
     weight: FloatArray
 
@@ -68,25 +68,25 @@ class Examples:
         return self.part(half * pixels, (half + 1) * pixels)
 
     def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.inputs, self.choices, self.target, self.weight
+        return self.inputs, self.candidates, self.target, self.weight
 
 
-def training_step(inputs: int, choices: int) -> onnx.ModelProto:
+def training_step(inputs: int, candidates: int) -> onnx.ModelProto:
     """Return the graph of one step.
 
-    Inputs: ``inputs`` (M, inputs), standardised, ``choices`` (M, choices, 3), ``target`` (M, 3) and
+    Inputs: ``inputs`` (M, inputs), standardised, ``candidates`` (M, candidates, 3), ``target`` (M, 3) and
     ``weight`` (M, 1), as in `Examples`; the vectors ``weights``, ``mean`` and ``square`` (Adam's moments)
     and the numbers (1,) ``learning_rate`` and ``step``, which counts from 1. Outputs: ``loss``, the vector
     ``gradient``, and the vectors ``next_weights``, ``next_mean`` and ``next_square``.
     """
     build = _Step()
-    shapes = weight_shapes(inputs, choices)
+    shapes = weight_shapes(inputs, candidates)
     size = sum(int(np.prod(shape)) for shape in shapes.values())
     gradient = build.gradient(shapes)
     build.adam(gradient)
     pixels: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", inputs),
-        "choices": ("M", choices, 3),
+        "candidates": ("M", candidates, 3),
         "target": ("M", 3),
         "weight": ("M", 1),
     }
@@ -96,9 +96,9 @@ def training_step(inputs: int, choices: int) -> onnx.ModelProto:
     return build.model("training_step", {**pixels, **vectors, **numbers}, given)
 
 
-def weight_shapes(inputs: int, choices: int) -> dict[str, tuple[int, ...]]:
+def weight_shapes(inputs: int, candidates: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of one member's weights, in the order of the vectors of `training_step`."""
-    sizes = (inputs, HIDDEN, HIDDEN, choices)
+    sizes = (inputs, HIDDEN, HIDDEN, candidates)
     shapes: dict[str, tuple[int, ...]] = {}
     for layer in (1, 2, 3):
         shapes[f"layer{layer}.weight"] = (sizes[layer], sizes[layer - 1])
@@ -110,7 +110,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
     """Return the weights that untrained members start from (He et al. 2015, uniform)."""
     rng = np.random.default_rng(seed)
     weights: Weights = {}
-    for name, (outputs, *inputs) in weight_shapes(len(layout.inputs), layout.choice_count).items():
+    for name, (outputs, *inputs) in weight_shapes(len(layout.inputs), layout.candidate_count).items():
         if inputs:
             bound = math.sqrt(6 / ((1 + LEAKY_SLOPE**2) * inputs[0]))
             shape = (members * outputs, *inputs, 1, 1)
@@ -119,7 +119,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
             weights[name] = np.zeros(members * outputs, np.float32)
     # Starts from the mean of the pilots that the head start gives, whatever the seed.
     weights["layer3.weight"][:] = 0
-    weights["layer3.bias"][layout.baseline :: layout.choice_count] = _HEAD_START
+    weights["layer3.bias"][layout.baseline :: layout.candidate_count] = _HEAD_START
     return weights
 
 
@@ -127,15 +127,17 @@ _Member = dict[str, FloatArray]
 """The vectors of `training_step` that are a member's own."""
 
 
-class PointwiseNetwork:
+class BlendNetwork:
     """The members of a network and the states of their optimisers; each keeps one of ``threads`` busy."""
 
-    def __init__(self, weights: Weights, inputs: int, choices: int, device: Device, threads: int = 1) -> None:
+    def __init__(
+        self, weights: Weights, inputs: int, candidates: int, device: Device, threads: int = 1
+    ) -> None:
         self._threads = threads
-        self._shapes = weight_shapes(inputs, choices)
+        self._shapes = weight_shapes(inputs, candidates)
         # The network is too small to share: threads would only wait for one another.
-        self._step = session_from_proto(training_step(inputs, choices), 1, device)
-        self._fuse = session_from_proto(_forward(inputs, choices), 1, device)
+        self._step = session_from_proto(training_step(inputs, candidates), 1, device)
+        self._blend = session_from_proto(_forward(inputs, candidates), 1, device)
         self._steps_done = 0
         self._members = self._states(weights)
 
@@ -144,7 +146,7 @@ class PointwiseNetwork:
         self._steps_done += 1
         feeds = {
             "inputs": batch.inputs,
-            "choices": batch.choices,
+            "candidates": batch.candidates,
             "target": batch.target,
             "weight": batch.weight,
             "learning_rate": np.array([learning_rate], np.float32),
@@ -157,28 +159,28 @@ class PointwiseNetwork:
 
         self._members = in_parallel(stepped, self._members, self._threads)
 
-    def fuse(self, inputs: FloatArray, choices: Iterable[FloatImage]) -> FloatArray:
-        """Return the mean of the choices, with the weights for ``inputs``, shape (pixels, 3).
+    def blend(self, inputs: FloatArray, candidates: Iterable[FloatImage]) -> FloatArray:
+        """Return the mean of the candidates, with the weights for ``inputs``, shape (pixels, 3).
 
-        ``inputs`` are as in `Examples`, ``choices`` images of shape (pixels, 3) or (height, width, 3).
+        ``inputs`` are as in `Examples`, ``candidates`` images of shape (pixels, 3) or (height, width, 3).
 
         Raises InputError if it is not finite.
         """
-        flat = [image.reshape(-1, 3) for image in choices]
-        fused = np.empty((len(inputs), 3), np.float32)
-        for first in range(0, len(fused), _RUN_PIXELS):
+        flat = [image.reshape(-1, 3) for image in candidates]
+        blended = np.empty((len(inputs), 3), np.float32)
+        for first in range(0, len(blended), _RUN_PIXELS):
             part = slice(first, first + _RUN_PIXELS)
             feeds = {
                 "inputs": inputs[part],
-                "choices": np.stack([image[part] for image in flat], axis=1),
+                "candidates": np.stack([image[part] for image in flat], axis=1),
             }
             by_members = (
-                self._fuse.run(["fused"], {**feeds, "weights": member["weights"]})[0]
+                self._blend.run(["blended"], {**feeds, "weights": member["weights"]})[0]
                 for member in self._members
             )
-            fused[part] = sum(by_members) / np.float32(len(self._members))
-        check_finite(fused)
-        return fused
+            blended[part] = sum(by_members) / np.float32(len(self._members))
+        check_finite(blended)
+        return blended
 
     def weights(self) -> Weights:
         """Return a copy of the weights, as those of 1x1 convolutions with a group for every member."""
@@ -212,24 +214,24 @@ def members_of(weights: Weights) -> int:
     return max(np.size(weights.get("layer1.bias", ())) // HIDDEN, 1)
 
 
-def _forward(inputs: int, choices: int) -> onnx.ModelProto:
-    """Return the graph of `PointwiseNetwork.fuse`."""
+def _forward(inputs: int, candidates: int) -> onnx.ModelProto:
+    """Return the graph of `BlendNetwork.blend`."""
     build = _Step()
-    shapes = weight_shapes(inputs, choices)
-    build.add("Transpose", build.forward(shapes)["mixed"], perm=[1, 0], output="fused")
+    shapes = weight_shapes(inputs, candidates)
+    build.add("Transpose", build.forward(shapes)["blended"], perm=[1, 0], output="blended")
     given: dict[str, tuple[int | str, ...]] = {
         "inputs": ("M", inputs),
-        "choices": ("M", choices, 3),
+        "candidates": ("M", candidates, 3),
         "weights": (sum(int(np.prod(shape)) for shape in shapes.values()),),
     }
-    return build.model("forward", given, {"fused": ("M", 3)})
+    return build.model("forward", given, {"blended": ("M", 3)})
 
 
 class _Step(GraphBuilder):
     """The parts of a step; columns of matrices are pixels, as long rows are what a processor is fast at."""
 
     def forward(self, shapes: dict[str, tuple[int, ...]]) -> dict[str, str]:
-        """Compute the choices' weighted means, ``mixed`` (3, M); return them, and what the gradients need."""
+        """Compute the candidates' means, ``blended`` (3, M); return them, and what the gradients need."""
         sizes = [int(np.prod(shape)) for shape in shapes.values()]
         known: dict[str, str] = {}
         for (name, shape), part in zip(shapes.items(), self.split("weights", sizes), strict=True):
@@ -247,11 +249,13 @@ class _Step(GraphBuilder):
         exp = self.add("Exp", self.add("Sub", x, self.add("ReduceMax", x, self.integers(0))))
         known["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
         count = shapes["layer3.bias"][0]
-        in_rows = self.add("Reshape", "choices", self.integers(-1, 3 * count))
+        in_rows = self.add("Reshape", "candidates", self.integers(-1, 3 * count))
         flat = self.add("Transpose", in_rows, perm=[1, 0])
-        known["choices"] = self.add("Reshape", flat, self.integers(count, 3, -1))
-        shared = self.add("Mul", known["choices"], self.add("Unsqueeze", known["shares"], self.integers(1)))
-        known["mixed"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
+        known["candidates"] = self.add("Reshape", flat, self.integers(count, 3, -1))
+        shared = self.add(
+            "Mul", known["candidates"], self.add("Unsqueeze", known["shares"], self.integers(1))
+        )
+        known["blended"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
         return known
 
     def gradient(self, shapes: dict[str, tuple[int, ...]]) -> str:
@@ -261,7 +265,7 @@ class _Step(GraphBuilder):
         """
         known = self.forward(shapes)
         target, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("target", "weight"))
-        difference = self.add("Sub", known["mixed"], target)
+        difference = self.add("Sub", known["blended"], target)
         weighted = self.add("Mul", difference, weight)
         squared = self.add("ReduceMean", self.add("Mul", weighted, difference), self.integers(0))
         error, most = self.add("Sqrt", squared), self.number(_LARGEST_ERROR)
@@ -274,9 +278,9 @@ class _Step(GraphBuilder):
         count = self.add("Cast", self.add("Size", "target"), to=onnx.TensorProto.FLOAT)
         pull = self.add("Div", most, self.add("Max", error, most))
         twice = self.add("Mul", pull, self.add("Div", self.number(2), count))
-        by_mixed = self.add("Mul", weighted, twice)
+        by_blended = self.add("Mul", weighted, twice)
         by_share = self.add(
-            "ReduceSum", self.add("Mul", known["choices"], by_mixed), self.integers(1), keepdims=0
+            "ReduceSum", self.add("Mul", known["candidates"], by_blended), self.integers(1), keepdims=0
         )
         # softmax: share * (derivative - mean of the derivatives by shares)
         mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(0))

@@ -1,9 +1,9 @@
-"""The presets draft, balanced and final: a small network chooses among pilots, trained across the halves.
+"""The presets draft, balanced and final: a small network blends pilots, trained across the halves.
 
-The network's inputs (`inputs`) are those of one pixel of one half. It outputs the weights of a mean of
-the pilots, and is trained to predict the other half, as in Lehtinen et al. 2018, "Noise2Noise". The noise of
-the other half is independent: it adds a constant to the loss and does not enter the image, whose mean is
-preserved but for errors so large that the loss bounds them (`pointwise`).
+The network's inputs (`inputs`) are those of one pixel of one half. It outputs the weights of a mean of the
+candidates (the noisy pixel and the pilots), and is trained to predict the other half, as in Lehtinen et al.
+2018, "Noise2Noise". The noise of the other half is independent: it adds a constant to the loss and does not
+enter the image, whose mean is preserved but for errors so large that the loss bounds them (`blend_network`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from threading import Event
 
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
+from tungsten_dip.fit.blend_network import BlendNetwork
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
@@ -27,7 +28,6 @@ from tungsten_dip.fit.pilots import (
     FOLLOWING_DRAFT_PILOTS,
     FOLLOWING_PILOTS,
 )
-from tungsten_dip.fit.pointwise import PointwiseNetwork
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
@@ -69,7 +69,7 @@ _PRESETS = {
 }
 
 
-def fit_fusion(
+def fit_blend(
     buffers: RenderBuffers,
     settings: FitSettings,
     progress: Progress,
@@ -83,8 +83,8 @@ def fit_fusion(
     further, not if a new one is fitted.
 
     ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
-    the shape of the colour, NaN where they have no value. They are a candidate and a guide, with which fewer
-    pilots are needed.
+    the shape of the colour, NaN where they have no value. They are an extra pilot and a guide, with which
+    fewer pilots are needed.
     """
     clock = Clock(settings.time_budget_s)
     unchanged = result_without_noise(buffers, settings, clock, progress)
@@ -94,23 +94,23 @@ def fit_fusion(
     following = previous is not None
     preset = _preset(settings, following)
     layout = None if warm_start is None else warm_start.layout
-    chosen = layout or _pilots(buffers, settings, preset, following)
-    evidence = evidence_from_buffers(halved, settings, chosen, clock, progress, previous)
+    plan = layout or _pilots(buffers, settings, preset, following)
+    evidence = evidence_from_buffers(halved, settings, plan, clock, progress, previous)
     start = start_of_training(evidence, settings.seed, warm_start, preset.members)
     if start.warm and refit_steps is not None:
         settings = replace(settings, iterations=refit_steps)
     evidence = start.evidence
-    network = PointwiseNetwork(
+    network = BlendNetwork(
         start.weights,
         len(evidence.layout.inputs),
-        evidence.layout.choice_count,
+        evidence.layout.candidate_count,
         settings.device,
         evidence.threads,
     )
     training, all_samples_pilots = _trained(network, start, halved.buffers, settings, preset, clock, progress)
     inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
-    fused, all_samples_blend = fused_images(network, inputs, evidence, all_samples_pilots)
-    result = denoised_image(evidence, fused, all_samples_blend, settings, clock)
+    denoised, all_samples_blend = blended_images(network, inputs, evidence, all_samples_pilots)
+    result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)
     if not training.interrupted:
         progress(1.0, f"relMSE {result.estimated_relmse:.4g}")
     return replace(
@@ -161,7 +161,7 @@ def _pilots(
 
 
 def _trained(
-    network: PointwiseNetwork,
+    network: BlendNetwork,
     start: Start,
     buffers: RenderBuffers,
     settings: FitSettings,
@@ -205,22 +205,24 @@ def _wait_for(pending: Future[tuple[FloatImage, ...]]) -> None:
         pass
 
 
-def fused_images(
-    network: PointwiseNetwork,
+def blended_images(
+    network: BlendNetwork,
     inputs: FloatArray,
     evidence: Evidence,
     all_samples_pilots: Sequence[FloatImage],
 ) -> tuple[Halves, FloatImage | None]:
-    """Return the network's blend of the pilots of both halves and, if given, of all samples.
+    """Return the network's blend of the candidates of both halves and, if given, of all samples.
 
     ``inputs`` are standardised, shape (2, height * width, inputs).
     """
     shape = evidence.mean.shape
 
-    def blend(half: int, pilots: Sequence[FloatImage]) -> FloatImage:
-        return network.fuse(inputs[half], pilots).reshape(shape)
+    def blend(half: int, candidates: Sequence[FloatImage]) -> FloatImage:
+        return network.blend(inputs[half], candidates).reshape(shape)
 
-    fused = in_pair(lambda h: blend(h, [choice[h] for choice in evidence.choices]), evidence.threads)
+    denoised = in_pair(
+        lambda h: blend(h, [candidate[h] for candidate in evidence.candidates]), evidence.threads
+    )
     if not all_samples_pilots:
-        return fused, None
-    return fused, mean_of(in_pair(lambda h: blend(h, all_samples_pilots), evidence.threads))
+        return denoised, None
+    return denoised, mean_of(in_pair(lambda h: blend(h, all_samples_pilots), evidence.threads))
