@@ -32,7 +32,9 @@ def _without(unwanted: Callable[[Pilot], bool]) -> Change:
 
 def _with_one_pilot() -> AbstractContextManager[object]:
     preset = blending._PRESETS["balanced"]
-    return mock.patch.dict(blending._PRESETS, balanced=replace(preset, pilots=(Pilot(10, k=1.0, step=2),)))
+    return mock.patch.dict(
+        blending._PRESETS, balanced=replace(preset, pilots=(Pilot("guided", 10, step=2, k=1.0),))
+    )
 
 
 VARIANTS: dict[str, Change] = {
@@ -45,10 +47,10 @@ VARIANTS: dict[str, Change] = {
     ),
     "one pilot and the noisy image": _with_one_pilot,
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
-    "only guided pilots": _without(lambda pilot: pilot.k is None and not pilot.along_edges),
+    "only guided pilots": _without(lambda pilot: pilot.kind == "features"),
     "no regression on the position": _without(lambda pilot: pilot.with_position),
-    "no mean along edges as a pilot": _without(lambda pilot: pilot.along_edges),
-    "no pilot that sees only the colour": _without(lambda pilot: pilot.by_color),
+    "no mean along edges as a pilot": _without(lambda pilot: pilot.kind == "edges"),
+    "no pilot that sees only the colour": _without(lambda pilot: pilot.kind == "color"),
     "features filtered in one pass": lambda: mock.patch.object(prefilter, "_PASSES", ((5, 1, 0.5),)),
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         surfaces, "_smooth_emission", lambda emission, filtered, *_: filtered

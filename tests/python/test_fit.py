@@ -535,7 +535,7 @@ def test_surfaces_of_a_half_take_nothing_but_weights_from_the_other(render: Synt
     assert np.abs(changed[0].albedo / plain[0].albedo - 1).mean() < 0.0025
 
 
-def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None:
+def test_a_pilot_of_the_color_does_without_features(render: SyntheticRender) -> None:
     """In mirrors and glass features are noise: what one pilot makes of the colour must not show it."""
     rng = np.random.default_rng(0)
 
@@ -552,11 +552,11 @@ def test_a_pilot_by_color_does_without_features(render: SyntheticRender) -> None
 
     features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
     noisy = render.buffers.with_quantities(**features)
-    by_color, by_features = Pilot(4, k=1.0, by_color=True), Pilot(4, k=1.0)
-    alone = images(render.buffers.with_quantities(**dict.fromkeys(features)), by_color)
-    np.testing.assert_array_equal(images(noisy, by_color), images(render.buffers, by_color))
-    np.testing.assert_array_equal(images(noisy, by_color), alone)
-    errors = [relmse(images(noisy, pilot)[0], render.reference) for pilot in (by_color, by_features)]
+    of_color, of_features = Pilot("color", 4, k=1.0), Pilot("guided", 4, k=1.0)
+    alone = images(render.buffers.with_quantities(**dict.fromkeys(features)), of_color)
+    np.testing.assert_array_equal(images(noisy, of_color), images(render.buffers, of_color))
+    np.testing.assert_array_equal(images(noisy, of_color), alone)
+    errors = [relmse(images(noisy, pilot)[0], render.reference) for pilot in (of_color, of_features)]
     assert errors[0] < 0.8 * errors[1]
 
 

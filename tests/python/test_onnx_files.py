@@ -50,11 +50,20 @@ def test_round_trip(model: Model, saved: Path) -> None:
     pilots=strategies.lists(
         strategies.builds(
             Pilot,
-            radius=strategies.integers(1, 32).map(lambda r: 2 * r),
-            k=strategies.none() | strategies.floats(0.1, 10),
-            step=strategies.sampled_from([1, 2]),
+            kind=strategies.just("features"),
+            radius=(radii := strategies.integers(1, 32).map(lambda r: 2 * r)),
+            step=(steps := strategies.sampled_from([1, 2])),
             with_position=strategies.booleans(),
-        ),
+        )
+        | strategies.builds(
+            Pilot,
+            kind=strategies.sampled_from(["guided", "color"]),
+            radius=radii,
+            step=steps,
+            k=strategies.floats(0.1, 10),
+            with_position=strategies.booleans(),
+        )
+        | strategies.builds(Pilot, kind=strategies.just("edges"), radius=radii),
         min_size=1,
         max_size=4,
     ),

@@ -152,7 +152,7 @@ def test_a_paper_model_gives_its_networks_output(frame: SyntheticRender) -> None
 
 
 def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> None:
-    layout = Layout(("depth.Z",), (Pilot(1),), 0, 1)
+    layout = Layout(("depth.Z",), (Pilot("features", 1),), 0, 1)
     inputs = len(layout.inputs)
     rng = np.random.default_rng(0)
     raw = np.full((2, inputs, 6, 7), 1e4, np.float32)

@@ -144,9 +144,7 @@ def whole_metadata(value: str) -> Spoil:
     return spoil
 
 
-PILOT = (
-    '{"along_edges": false, "by_color": false, "k": null, "radius": 1, "step": 1, "with_position": false}, '
-)
+PILOT = '{"k": null, "kind": "features", "radius": 1, "step": 1, "with_position": false}, '
 
 HOSTILE: list[tuple[Spoil, str]] = [
     (external, "within the file"),
@@ -176,6 +174,14 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"extra_pilots": 0', '"extra_pilots": 1000000000000'), "inputs|layout"),
     (metadata('"radius": 1', '"radius": 1000000000'), "radius"),
     (metadata('"step": 1', '"step": 0'), "radius"),
+    (metadata('"radius": 6, "step": 2', '"radius": 6, "step": 4'), "multiple of step"),
+    (metadata('"kind": "features"', '"kind": "median"'), "kind: found 'median'"),
+    (metadata('"kind": "features"', '"kind": ["features"]'), "kind: found"),
+    (metadata('"kind": "features"', '"kind": "guided"'), "expected k for"),
+    (metadata('"kind": "guided"', '"kind": "features"'), "expected k for"),
+    (metadata('"kind": "guided"', '"kind": "edges"'), "expected k for"),
+    (metadata('"k": null, "kind": "features"', '"k": 1.0, "kind": "edges"'), "expected k for"),
+    (metadata('"radius": 6, "step": 2', '"radius": 65, "step": 5'), "radius up to 64"),
     (metadata('"k": 1.0', '"k": 1e-30'), "k from"),
     (metadata('"k": 1.0', f'"k": {10**400}'), "k: found 1000"),
     (metadata('"radius": 1', f'"radius": {10**400}'), "radius: found 1000"),

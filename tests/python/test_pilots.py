@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,12 +115,14 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     halves = _noisy(np.where(surface, 0.03, 0), shape=0.2)
     depth = Buffer(np.where(surface, 2, 0)[:, :, None].astype(np.float32))
     surfaces = surfaces_of_halves(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
-    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(Pilot(6, k=1.0, step=2)):
+    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(
+        Pilot("guided", 6, step=2, k=1.0)
+    ):
         assert image[surface].mean() == pytest.approx(0.03, rel=0.1)
         assert image[~surface].max() < 1e-6
 
 
-def test_the_previous_frame_guides_pilots_by_color() -> None:
+def test_the_previous_frame_guides_pilots_of_the_color() -> None:
     """It shows stripes of shadow that the noise hides."""
     truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
     halves, previous = _noisy(truth, shape=0.5), (_rgb(truth), _rgb(truth))
@@ -127,7 +130,25 @@ def test_the_previous_frame_guides_pilots_by_color() -> None:
     alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces))
     guided = replace(alone, previous=previous)
     errors = [
-        np.mean((maker.images(Pilot(4, k=1.0, by_color=True))[0] - _rgb(truth)) ** 2)
-        for maker in (alone, guided)
+        np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - _rgb(truth)) ** 2) for maker in (alone, guided)
     ]
     assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"kind": "guided"},
+        {"kind": "color"},
+        {"kind": "features", "k": 1.0},
+        {"kind": "edges", "k": 1.0},
+        {"kind": "edges", "step": 2},
+        {"kind": "edges", "with_position": True},
+        {"kind": "features", "step": 0},
+        {"kind": "features", "step": 4},
+        {"kind": "features", "step": 12},
+    ],
+)
+def test_a_pilot_that_no_filter_computes_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Pilot(radius=6, **wrong)

@@ -28,7 +28,9 @@ from torch_network import TorchNetwork  # noqa: E402
 
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
-    evidence = evidence_of(synthetic_render(24, 20, seed=seed).buffers, (Pilot(1), Pilot(3)))
+    evidence = evidence_of(
+        synthetic_render(24, 20, seed=seed).buffers, (Pilot("features", 1), Pilot("features", 3))
+    )
     return start_of_training(evidence, seed, None, 1).examples, evidence.layout
 
 
@@ -147,7 +149,7 @@ def test_a_refit_does_what_a_warm_start_does(model: Model, next_frame: Synthetic
 
 
 def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
-    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
     whole = network_inputs(evidence).reshape(2, 32, 48, -1)
     upper = network_inputs(evidence.rows(0, 28)).reshape(2, 28, 48, -1)
     lower = network_inputs(evidence.rows(4, 32)).reshape(2, 28, 48, -1)
@@ -158,7 +160,7 @@ def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
 
 def test_the_network_sees_its_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
     """Or it would prefer a noisy pixel for being dark."""
-    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
     y, x, half = 11, 17, 0
     noisy = [image.copy() for image in evidence.halves]
     noisy[half][y, x] *= 3
@@ -170,7 +172,7 @@ def test_the_network_sees_its_halfs_noise_of_no_pixel_at_that_pixel(frame: Synth
 
 def test_the_network_sees_the_scoring_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
     """Nor may the weight of the pixel in the loss depend on it, or the image would darken."""
-    evidence = evidence_of(frame.buffers, (Pilot(1), Pilot(3)))
+    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
     before = np.stack(list(inputs_of_half(evidence, 0)), axis=2)
     largest_change = 0.0
     for y in range(3, 32, 4):

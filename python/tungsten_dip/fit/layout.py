@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 SCORE_RADII = (2, 4, 8, 16)
-"""Of the windows in which a pilot is scored."""
+"""Radii of the windows in which a candidate is scored, in pixels."""
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """One window of regression, ``radius`` and ``step`` in pixels.
+    """One filter, ``radius`` and ``step`` in pixels. What it does with the pixels around depends on its kind.
 
-    ``k`` is the damping of non-local means by a guide; None: neighbours are weighted by features alone.
-    ``with_position``: the pixel's position is a further feature. ``along_edges``: no regression, but the mean
-    along the edges of the features, with the standard deviation ``radius``. It estimates how much of a pixel
-    each surface covers better than the samples in the pixel do. ``by_color``: without features and albedo,
-    which on mirrors, in glass and out of focus are as noisy as the colour.
+    - ``features``: a regression on the features, by which neighbours are weighted.
+    - ``guided``: the same, with neighbours weighted by a guide; ``k`` is the damping of non-local means.
+    - ``color``: guided, without features and albedo, which on mirrors, in glass and out of focus are as noisy
+      as the colour.
+    - ``edges``: the mean along the edges of the features, with the standard deviation ``radius``. It
+      estimates how much of a pixel each surface covers better than the samples in the pixel do.
+
+    A regression looks at every ``step``-th row and column. ``with_position``: the pixel's position is a
+    further feature of it.
+
+    Raises ValueError if the radius is no multiple of the step, a guided kind lacks ``k``, or something is
+    given that the kind does not use.
     """
 
+    kind: Literal["features", "guided", "color", "edges"]
     radius: int
-    k: float | None = None
     step: int = 1
+    k: float | None = None
     with_position: bool = False
-    along_edges: bool = False
-    by_color: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.step <= self.radius or self.radius % self.step:
+            raise ValueError(f"expected a radius that is a multiple of step, got {self.radius}, {self.step}")
+        if (self.k is not None) != (self.kind in ("guided", "color")):
+            raise ValueError(f"expected k for the kinds guided and color alone, got {self.k} for {self.kind}")
+        if self.kind == "edges" and (self.step != 1 or self.with_position):
+            raise ValueError("expected neither step nor position for the kind edges")
 
 
 @dataclass(frozen=True)

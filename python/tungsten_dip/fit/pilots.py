@@ -20,8 +20,8 @@ from tungsten_dip.fit.surfaces import EDGES_RADIUS, Surfaces, along_edges
 
 _POSITION_SCALE_PIXELS = 20.0
 _GUIDE_OFFSET = 0.05
-"""Guides are log(irradiance + offset), of radiance for `Pilot.by_color`: far below the offset it is absolute
-differences that are visible, not relative ones."""
+"""Guides are log(irradiance + offset), of radiance for pilots of kind color: far below the offset it is
+absolute differences that are visible, not relative ones."""
 
 _GUIDE_NOISE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
@@ -31,46 +31,46 @@ _SAMPLES_OF_GUIDE = 12
 noise, which is taken to be that of the image divided by this."""
 
 
-_FIRST_GUIDE = Pilot(radius=3)
-_FIRST_GUIDE_WITHOUT_FEATURES = Pilot(radius=1)
+_FIRST_GUIDE = Pilot("features", 3)
+_FIRST_GUIDE_WITHOUT_FEATURES = Pilot("features", 1)
 """Without features, a window blurs every edge within it."""
 
-_SECOND_GUIDE = Pilot(radius=8, k=1.0, step=2)
+_SECOND_GUIDE = Pilot("guided", 8, step=2, k=1.0)
 """Guided by the first, it is the guide of all pilots."""
 
-_EDGES = Pilot(EDGES_RADIUS, along_edges=True)
+_EDGES = Pilot("edges", EDGES_RADIUS)
 
 # Small windows keep detail, large ones average out the remaining noise; guided ones keep shadows and
 # reflections, which no feature contains; a regression on the position follows gradients. Within a time budget
 # the first ones are computed, so that cheap ones come first. Errors are relative to the last one that is
 # computed, or to the median.
-DRAFT_PILOTS = (Pilot(1), _EDGES, Pilot(6, step=2), Pilot(6, k=1.0, step=2))
+DRAFT_PILOTS = (Pilot("features", 1), _EDGES, Pilot("features", 6, step=2), Pilot("guided", 6, step=2, k=1.0))
 BALANCED_PILOTS = (
-    Pilot(1),
+    Pilot("features", 1),
     _EDGES,
-    Pilot(5),
-    Pilot(12, step=2, with_position=True),
-    Pilot(4, k=1.0),
-    Pilot(10, k=1.0, step=2),
-    Pilot(10, k=2.0, step=2, with_position=True),
-    Pilot(18, k=1.5, step=2, with_position=True),
-    Pilot(4, k=1.0, by_color=True),
+    Pilot("features", 5),
+    Pilot("features", 12, step=2, with_position=True),
+    Pilot("guided", 4, k=1.0),
+    Pilot("guided", 10, step=2, k=1.0),
+    Pilot("guided", 10, step=2, k=2.0, with_position=True),
+    Pilot("guided", 18, step=2, k=1.5, with_position=True),
+    Pilot("color", 4, k=1.0),
 )
 # Larger windows leave fewer blotches on smooth walls and in fog.
 FINAL_PILOTS = (
     *BALANCED_PILOTS,
-    Pilot(24, step=3, with_position=True),
-    Pilot(32, k=2.0, step=4, with_position=True),
+    Pilot("features", 24, step=3, with_position=True),
+    Pilot("guided", 32, step=4, k=2.0, with_position=True),
 )
 
 # Enough beside the previous frame. The first replaces it where it has no value.
-FOLLOWING_DRAFT_PILOTS = (Pilot(1), _EDGES, Pilot(8, step=4, with_position=True))
+FOLLOWING_DRAFT_PILOTS = (Pilot("features", 1), _EDGES, Pilot("features", 8, step=4, with_position=True))
 FOLLOWING_PILOTS = (
-    Pilot(1),
+    Pilot("features", 1),
     _EDGES,
-    Pilot(12, step=3, with_position=True),
-    Pilot(6, k=2.0, step=3),
-    Pilot(4, k=1.0, by_color=True),
+    Pilot("features", 12, step=3, with_position=True),
+    Pilot("guided", 6, step=3, k=2.0),
+    Pilot("color", 4, k=1.0),
 )
 
 
@@ -78,8 +78,8 @@ FOLLOWING_PILOTS = (
 class Guides:
     """What guided pilots compare and denoise, one image for each half or for the mean, (height, width, 3).
 
-    ``images`` are smoothed log irradiance, or log radiance for pilots ``by_color``. ``noise`` is the variance
-    of one of them, ``irradiances`` the noisy irradiance (or radiance) that is regressed.
+    ``images`` are smoothed log irradiance, or log radiance for pilots of kind color. ``noise`` is the
+    variance of one of them, ``irradiances`` the noisy irradiance (or radiance) that is regressed.
     """
 
     images: tuple[FloatImage, ...]
@@ -139,7 +139,7 @@ def following_guides(
 class PilotMaker:
     """Computes the pilots of both halves, or of the mean alone; ``variance`` as in `first_guides`.
 
-    ``previous``, the filled frame of `following_guides`, is the guide of pilots ``by_color`` if given.
+    ``previous``, the filled frame of `following_guides`, is the guide of pilots of kind color if given.
     """
 
     colors: tuple[FloatImage, ...]
@@ -150,19 +150,23 @@ class PilotMaker:
 
     def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
         """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
-        if pilot.along_edges:
-            return tuple(
-                along_edges(color, s.edges, pilot.radius, s.threads)
-                for color, s in zip(self.colors, self.surfaces, strict=True)
-            )
-        surfaces, guides = self._by_color if pilot.by_color else (self.surfaces, self.guides)
+        match pilot.kind:
+            case "edges":
+                return tuple(
+                    along_edges(color, s.edges, pilot.radius, s.threads)
+                    for color, s in zip(self.colors, self.surfaces, strict=True)
+                )
+            case "color":
+                surfaces, guides = self._of_color
+            case "features" | "guided":
+                surfaces, guides = self.surfaces, self.guides
         return tuple(
             s.color(_regress(image, pilot, s, guide, guides.noise))
             for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
         )
 
     @cached_property
-    def _by_color(self) -> tuple[tuple[Surfaces, ...], Guides]:
+    def _of_color(self) -> tuple[tuple[Surfaces, ...], Guides]:
         surfaces = tuple(s.without_features() for s in self.surfaces)
         if self.previous is not None:
             return surfaces, _guides(self.previous, self.colors, surfaces[0])

@@ -236,10 +236,13 @@ def _layout(facts: dict[str, Any]) -> Layout:
         hints = get_type_hints(Pilot)
         if pilot.keys() != {field.name for field in fields(Pilot)}:
             raise InputError(f"pilots: expected {', '.join(hints)}, found {', '.join(pilot)}"[:200])
-        pilots.append(Pilot(**{name: _checked(name, pilot[name], hints[name]) for name in hints}))
-        radius, step = pilots[-1].radius, pilots[-1].step
-        if not 0 < step <= radius <= _LARGEST_RADIUS or radius % step:
-            raise InputError(f"pilots: expected a radius up to {_LARGEST_RADIUS}, a multiple of step")
+        checked = {name: _checked(name, pilot[name], hints[name]) for name in hints}
+        try:
+            pilots.append(Pilot(**checked))
+        except ValueError as error:
+            raise InputError(f"pilots: {error}") from None
+        if pilots[-1].radius > _LARGEST_RADIUS:
+            raise InputError(f"pilots: expected a radius up to {_LARGEST_RADIUS}, found {pilots[-1].radius}")
         if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
             raise InputError("pilots: expected k from 0.01 to 100")
     features = _checked("features", facts.get("features"), tuple[str, ...])
