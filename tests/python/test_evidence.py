@@ -10,7 +10,7 @@ import pytest
 from conftest import MakeRender
 from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, _caps, _denominators, _noises
+from tungsten_dip.fit.evidence import Evidence, _baseline_errors, _caps, _denominators
 from tungsten_dip.fit.exposure import unscaled
 from tungsten_dip.fit.inputs import loss_weights
 from tungsten_dip.fit.pilots import PilotMaker
@@ -33,7 +33,7 @@ def test_guides_are_as_noisy_as_is_said_of_them(
         guides = [maker.guides for maker in makers if len(maker.colors) == images]
         assert len(guides) == 4
         true = np.var([guide.images[0] for guide in guides], axis=0, ddof=1).mean()
-        said = np.mean([guide.noise for guide in guides])
+        said = np.mean([guide.variance for guide in guides])
         assert said == pytest.approx(true, rel=0.3)
 
 
@@ -65,7 +65,7 @@ def test_errors_are_relative_to_the_darker_of_the_last_pilot_and_the_median_one(
     np.testing.assert_allclose(of_b, 0.5**2 + 0.01)
 
 
-def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:
+def test_one_outlier_is_a_small_part_of_the_error_around_it() -> None:
     """It counts as 20 times the mean error of a half by itself in the 17x17 pixels around."""
     noisy, flat = np.ones((40, 40, 3), np.float32), np.zeros((40, 40, 3), np.float32)
     candidates, ones = ((noisy, 2 * noisy), (flat, flat)), np.ones((40, 40, 1), np.float32)
@@ -74,8 +74,8 @@ def test_one_outlier_is_a_small_part_of_the_noise_around_it() -> None:
     np.testing.assert_allclose(caps[1], 80, rtol=1e-3)
     error = np.zeros((40, 40, 1), np.float32)
     error[20, 20] = 1e6
-    noise, _ = _noises((error, error), caps, 1)
-    assert noise[18, 22, 0] == pytest.approx(20 / (17**2 - 1), rel=1e-3)
+    errors, _ = _baseline_errors((error, error), caps, 1)
+    assert errors[18, 22, 0] == pytest.approx(20 / (17**2 - 1), rel=1e-3)
 
 
 def test_radiance_that_the_renderers_units_cannot_hold_is_the_largest_number() -> None:

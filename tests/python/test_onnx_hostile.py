@@ -196,7 +196,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"channels": [8', '"channels": [' + 62 * "8, " + "8"), "channels"),
     (metadata('"channels": [8', '"channels": [' + 20_000 * "8, " + "8"), "channels"),
     (metadata('"seed": 0', '"seed": NaN'), "JSON"),
-    (metadata('"noise"', '"nois"'), "inputs"),
+    (metadata('"baseline error"', '"baseline"'), "inputs"),
     (metadata('"version": "', '"version": "1'), "constants or attributes|graph"),
     (metadata('{"', '{"extra": 1, "'), "graph"),
     (whole_metadata("[" * 100_000), "JSON"),

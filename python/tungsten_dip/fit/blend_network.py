@@ -119,7 +119,7 @@ def first_weights(layout: Layout, seed: int, members: int) -> Weights:
             weights[name] = np.zeros(members * outputs, np.float32)
     # Starts from the mean of the pilots that the head start gives, whatever the seed.
     weights["layer3.weight"][:] = 0
-    weights["layer3.bias"][layout.baseline :: layout.candidate_count] = _HEAD_START
+    weights["layer3.bias"][layout.baseline_index :: layout.candidate_count] = _HEAD_START
     return weights
 
 

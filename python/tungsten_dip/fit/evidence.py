@@ -40,7 +40,7 @@ from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
 from tungsten_dip.progress import Progress
 
-_NOISE_RADIUS = 8
+_ERROR_RADIUS = 8
 _NEAR_RADIUS = 2
 """Radius of the window in which no sample may have hit anything, for a pixel to be empty space."""
 
@@ -64,12 +64,12 @@ class Evidence:
 
     ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
     (height, width). ``candidates`` holds both halves of the noisy image, of every pilot, of every extra
-    pilot. ``noises`` is the relative squared difference, shape (height, width, 1), of the baseline pilot and
-    the other half, in the pixels around each; ``denominators``, same shape, are what all squared errors of a
-    half are relative to. Errors count up to ``caps``, which are made from the half itself, so that neither
-    noise nor scores of a pixel depend on its value in the half that scores it. ``guide_noise`` is that of the
-    pilots' guides (see `Guides`). ``gain`` is what gives back the radiance of fireflies
-    (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
+    pilot. ``baseline_errors`` is the relative squared difference, shape (height, width, 1), of the baseline
+    pilot and the other half, in the pixels around each; ``denominators``, same shape, are what all squared
+    errors of a half are relative to. Errors count up to ``caps``, which are made from the half itself, so
+    that neither errors nor scores of a pixel depend on its value in the half that scores it.
+    ``guide_variance`` is that of the pilots' guides (see `Guides`). ``gain`` is what gives back the radiance
+    of fireflies (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
 
     scale: float
@@ -77,10 +77,10 @@ class Evidence:
     features: tuple[dict[str, FloatImage], ...]
     layout: Layout
     candidates: tuple[Halves, ...]
-    noises: Halves
+    baseline_errors: Halves
     denominators: Halves
     caps: Halves
-    guide_noise: FloatImage
+    guide_variance: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
     notes: tuple[str, ...]
@@ -108,10 +108,10 @@ class Evidence:
                 {name: image[first:end] for name, image in features.items()} for features in self.features
             ),
             candidates=tuple(cut(candidate) for candidate in self.candidates),
-            noises=cut(self.noises),
+            baseline_errors=cut(self.baseline_errors),
             denominators=cut(self.denominators),
             caps=cut(self.caps),
-            guide_noise=self.guide_noise[first:end],
+            guide_variance=self.guide_variance[first:end],
             gain=None if self.gain is None else self.gain[first:end],
         )
 
@@ -161,7 +161,9 @@ def evidence_from_buffers(
         baseline = _best(candidates, denominators)
         layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(extra_pilots), baseline)
     caps = _caps(candidates, denominators, threads)
-    noises = _noises(_errors(candidates[layout.baseline], halves, denominators), caps, threads)
+    baseline_errors = _baseline_errors(
+        _errors(candidates[layout.baseline_index], halves, denominators), caps, threads
+    )
     features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
     notes = (*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes)
     return Evidence(
@@ -170,10 +172,10 @@ def evidence_from_buffers(
         features=features,
         layout=layout,
         candidates=candidates,
-        noises=noises,
+        baseline_errors=baseline_errors,
         denominators=denominators,
         caps=caps,
-        guide_noise=guides.noise,
+        guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
         notes=notes,
@@ -258,7 +260,7 @@ def pilots_of_all_samples(
     a, b = evidence.halves
     variance = np.float32(0.25) * (a - b) ** 2
     guides = first_guides(colors, surfaces, variance)
-    guides = replace(guides, noise=evidence.guide_noise / np.float32(2))
+    guides = replace(guides, variance=evidence.guide_variance / np.float32(2))
     maker = PilotMaker(colors, surfaces, guides, variance)
     occupied = _occupied(evidence.halves, buffers, evidence.threads)
     computed = []
@@ -276,8 +278,10 @@ def with_best_baseline(evidence: Evidence) -> Evidence:
     candidates, denominators = evidence.candidates, evidence.denominators
     baseline = _best(candidates, denominators)
     errors = _errors(candidates[baseline], evidence.halves, denominators)
-    noises = _noises(errors, evidence.caps, evidence.threads)
-    return replace(evidence, layout=replace(evidence.layout, baseline=baseline), noises=noises)
+    baseline_errors = _baseline_errors(errors, evidence.caps, evidence.threads)
+    return replace(
+        evidence, layout=replace(evidence.layout, baseline_index=baseline), baseline_errors=baseline_errors
+    )
 
 
 def _best(candidates: Sequence[Halves], denominators: Halves) -> int:
@@ -298,17 +302,17 @@ def _caps(candidates: Sequence[Halves], denominators: Halves, threads: int) -> H
             for candidate in candidates[1:]
         )
         mean = sum(errors, np.zeros_like(denominators[half])) / np.float32(len(candidates) - 1)
-        around = _core.box_mean(mean, _NOISE_RADIUS, threads)
+        around = _core.box_mean(mean, _ERROR_RADIUS, threads)
         return np.float32(_OUTLIER) * around + np.float32(_LEAST_CAP)
 
     return cap(0), cap(1)
 
 
-def _noises(errors_of_baseline: Halves, caps: Halves, threads: int) -> Halves:
-    """Return `Evidence.noises`."""
+def _baseline_errors(errors_of_baseline: Halves, caps: Halves, threads: int) -> Halves:
+    """Return `Evidence.baseline_errors`."""
     a, b = (
         # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
-        np.maximum(mean_around(np.minimum(error, cap), _NOISE_RADIUS, threads), 0)
+        np.maximum(mean_around(np.minimum(error, cap), _ERROR_RADIUS, threads), 0)
         for error, cap in zip(errors_of_baseline, caps, strict=True)
     )
     return a, b

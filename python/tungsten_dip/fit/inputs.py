@@ -33,7 +33,7 @@ _LARGEST_BRIGHTNESS = 2.0
 """Pilots more than e^2 times brighter than the baseline, or darker, are as far off."""
 
 _SCORE_UNIT = 0.05
-"""A pilot that is worse than the baseline by this part of the noise scores 1, ..."""
+"""A pilot that is worse than the baseline by this part of the baseline's error scores 1, ..."""
 
 _LARGEST_SCORE = 3.0
 """... and this is the worst score."""
@@ -50,8 +50,8 @@ def loss_weights(evidence: Evidence) -> Halves:
     """
     with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
         weight_a, weight_b = (
-            np.reciprocal(d * (np.float32(_LEAST_NOISE) + noise))
-            for d, noise in zip(evidence.denominators, evidence.noises, strict=True)
+            np.reciprocal(d * (np.float32(_LEAST_NOISE) + error))
+            for d, error in zip(evidence.denominators, evidence.baseline_errors, strict=True)
         )
     return weight_a, weight_b
 
@@ -65,25 +65,26 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     threads, layout = max(evidence.threads // 2, 1), evidence.layout
     for name in layout.features:
         yield evidence.features[half][name]
-    noise = evidence.noises[half]
-    yield np.log(noise + np.float32(_LEAST_ERROR))[:, :, 0]
-    base = _log_level(evidence.candidates[layout.baseline][half])
+    around = evidence.baseline_errors[half]
+    yield np.log(around + np.float32(_LEAST_ERROR))[:, :, 0]
+    baseline = evidence.candidates[layout.baseline_index][half]
+    base = _log_level(baseline)
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
     denominator = evidence.denominators[half]
-    unit = np.float32(_SCORE_UNIT) * noise + np.float32(_LEAST_ERROR)
+    unit = np.float32(_SCORE_UNIT) * around + np.float32(_LEAST_ERROR)
     cap = evidence.caps[half]
-    baseline = np.minimum(relative_error(evidence.candidates[layout.baseline][half], other, denominator), cap)
+    baseline_error = np.minimum(relative_error(baseline, other, denominator), cap)
     for index, candidate in enumerate(evidence.candidates):
-        if index == layout.baseline:
+        if index == layout.baseline_index:
             continue
         image = candidate[half]
         if index == 0:
             # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
             image = np.maximum(mean_around(image, 1, threads), 0)
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
-        worse = np.minimum(relative_error(candidate[half], other, denominator), cap) - baseline
+        worse = np.minimum(relative_error(candidate[half], other, denominator), cap) - baseline_error
         for radius in SCORE_RADII:
             score = mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]

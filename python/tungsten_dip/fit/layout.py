@@ -48,13 +48,13 @@ class Layout:
 
     ``features`` names channels of the features. The candidates are the noisy image, then the ``pilots`` that
     our filters compute, then ``extra_count`` extra pilots: Open Image Denoise's image, the previous frame.
-    ``baseline`` is the index of the candidate that the others are compared with, never the noisy image.
+    ``baseline_index`` is that of the candidate that the others are compared with, never the noisy image.
     """
 
     features: tuple[str, ...]
     pilots: tuple[Pilot, ...]
     extra_count: int
-    baseline: int
+    baseline_index: int
 
     @property
     def candidate_count(self) -> int:
@@ -66,12 +66,12 @@ class Layout:
         """The names of what `inputs_of_half` yields, in its order."""
         return (
             *self.features,
-            "noise",
+            "baseline error",
             "level",
             *(
                 f"candidate {index} {what}"
                 for index in range(self.candidate_count)
-                if index != self.baseline
+                if index != self.baseline_index
                 for what in ("brightness", *(f"score {radius}" for radius in SCORE_RADII))
             ),
         )

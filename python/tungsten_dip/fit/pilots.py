@@ -23,7 +23,7 @@ _GUIDE_OFFSET = 0.05
 """Guides are log(irradiance + offset), of radiance for pilots of kind color: far below the offset it is
 absolute differences that are visible, not relative ones."""
 
-_GUIDE_NOISE_RADIUS = 3
+_GUIDE_VARIANCE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
 _SAMPLES_OF_GUIDE = 12
@@ -78,34 +78,34 @@ FOLLOWING_PILOTS = (
 class Guides:
     """What guided pilots compare and denoise, one image for each half or for the mean, (height, width, 3).
 
-    ``images`` are smoothed log irradiance, or log radiance for pilots of kind color. ``noise`` is the
-    variance of one of them, ``irradiances`` the noisy irradiance (or radiance) that is regressed.
+    ``images`` are smoothed log irradiance, or log radiance for pilots of kind color. ``variance`` is
+    that of one of them, ``irradiances`` the noisy irradiance (or radiance) that is regressed.
     """
 
     images: tuple[FloatImage, ...]
-    noise: FloatImage
+    variance: FloatImage
     irradiances: tuple[FloatImage, ...]
 
 
 def first_guides(
-    colors: tuple[FloatImage, ...], surfaces: tuple[Surfaces, ...], variance: FloatImage | None = None
+    colors: tuple[FloatImage, ...], surfaces: tuple[Surfaces, ...], color_variance: FloatImage | None = None
 ) -> Guides:
     """Return the guides of the two halves, or of the mean alone.
 
-    The noise of guides is estimated from the difference of the halves' or, for the mean alone, from its
-    ``variance`` (same shape).
+    The variance of the guides is estimated from the difference of the halves' or, for the mean alone, from
+    ``color_variance``, that of its colour (same shape).
     """
     irradiances = tuple(s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
     first = _FIRST_GUIDE if surfaces[0].penalty else _FIRST_GUIDE_WITHOUT_FEATURES
     smooth = tuple(
         np.maximum(_regress(image, first, s), 0) for image, s in zip(irradiances, surfaces, strict=True)
     )
-    guides = _guides(smooth, irradiances, surfaces[0], variance)
+    guides = _guides(smooth, irradiances, surfaces[0], color_variance)
     smooth = tuple(
-        np.maximum(_regress(image, _SECOND_GUIDE, s, guide, guides.noise), 0)
+        np.maximum(_regress(image, _SECOND_GUIDE, s, guide, guides.variance), 0)
         for image, guide, s in zip(irradiances, guides.images, surfaces, strict=True)
     )
-    return _guides(smooth, irradiances, surfaces[0], variance)
+    return _guides(smooth, irradiances, surfaces[0], color_variance)
 
 
 def following_guides(
@@ -137,7 +137,7 @@ def following_guides(
 
 @dataclass
 class PilotMaker:
-    """Computes the pilots of both halves, or of the mean alone; ``variance`` as in `first_guides`.
+    """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `first_guides`.
 
     ``previous``, the filled frame of `following_guides`, is the guide of pilots of kind color if given.
     """
@@ -145,7 +145,7 @@ class PilotMaker:
     colors: tuple[FloatImage, ...]
     surfaces: tuple[Surfaces, ...]
     guides: Guides
-    variance: FloatImage | None = None
+    color_variance: FloatImage | None = None
     previous: Halves | None = None
 
     def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
@@ -161,7 +161,7 @@ class PilotMaker:
             case "features" | "guided":
                 surfaces, guides = self.surfaces, self.guides
         return tuple(
-            s.color(_regress(image, pilot, s, guide, guides.noise))
+            s.color(_regress(image, pilot, s, guide, guides.variance))
             for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
         )
 
@@ -170,24 +170,25 @@ class PilotMaker:
         surfaces = tuple(s.without_features() for s in self.surfaces)
         if self.previous is not None:
             return surfaces, _guides(self.previous, self.colors, surfaces[0])
-        return surfaces, first_guides(self.colors, surfaces, self.variance)
+        return surfaces, first_guides(self.colors, surfaces, self.color_variance)
 
 
 def _guides(
     images: tuple[FloatImage, ...],
     irradiances: tuple[FloatImage, ...],
     surfaces: Surfaces,
-    variance: FloatImage | None = None,
+    color_variance: FloatImage | None = None,
 ) -> Guides:
     guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
     if len(guides) == 2:
-        noise = (guides[0] - guides[1]) ** 2 / 2
+        variance = (guides[0] - guides[1]) ** 2 / 2
     else:
-        assert variance is not None
-        squared = variance / surfaces.albedo**2
-        noise = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
-    noise = _core.box_mean(np.ascontiguousarray(noise, np.float32), _GUIDE_NOISE_RADIUS, surfaces.threads)
-    return Guides(guides, noise + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
+        assert color_variance is not None
+        squared = color_variance / surfaces.albedo**2
+        variance = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
+    variance = np.ascontiguousarray(variance, np.float32)
+    variance = _core.box_mean(variance, _GUIDE_VARIANCE_RADIUS, surfaces.threads)
+    return Guides(guides, variance + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
 
 
 def _regress(

@@ -104,7 +104,7 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
             "features": model.layout.features,
             "pilots": [asdict(pilot) for pilot in model.layout.pilots],
             "extra_pilots": model.layout.extra_count,
-            "baseline": model.layout.baseline,
+            "baseline": model.layout.baseline_index,
         }
     return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
 
