@@ -268,6 +268,7 @@ PYBIND11_MODULE(_core, module) {
     module.doc() = "The core of tungsten-dip in C++. _core.pyi documents it; use tungsten_dip.buffers.";
 
     module.attr("INFINITE_DEPTH") = infinite_depth;
+    module.attr("INFINITE_RADIANCE") = infinite_radiance;
 
     py::class_<Defects>(module, "Defects")
         .def_readonly("nan", &Defects::nan)

@@ -87,9 +87,12 @@ void parallel_for(int count, int threads, const std::function<void(int)>& body);
 // A depth from here on counts as infinite: renderers mark the sky so (Blender 1e10, Arnold 1e30).
 constexpr float infinite_depth = 1e9F;
 
-// How many values of an image cannot be meant. As infinite count, beside such depths, a component of a normal
-// of 1e6 and more, an albedo or visibility of 1e12 and more, radiance of 1e36 and more, and variances from
-// the squares of these on. Normals may be negative; no other quantity and no variance may.
+// Radiance from here on counts as infinite: sums of some hundreds overflow.
+constexpr float infinite_radiance = 1e36F;
+
+// How many values of an image cannot be meant. As infinite count, beside such depths and radiance, a
+// component of a normal of 1e6 and more, an albedo or visibility of 1e12 and more, and variances from the
+// squares of these on. Normals may be negative; no other quantity and no variance may.
 struct Defects {
     std::int64_t nan = 0;
     std::int64_t infinite = 0;

@@ -12,7 +12,6 @@
 namespace tungsten_dip {
 namespace {
 
-constexpr float infinite_radiance = 1e36F;  // sums of some hundreds overflow
 // Squares of what is beyond these overflow.
 constexpr float infinite_normal = 1e6F;
 constexpr float infinite_albedo = 1e12F;  // which holds the radiance of lights, too

@@ -16,6 +16,9 @@ from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Quantity
 INFINITE_DEPTH: float
 """A depth from here on counts as infinite: the sky."""
 
+INFINITE_RADIANCE: float
+"""Radiance from here on counts as infinite."""
+
 class Defects:
     """How many values of an image no renderer can have meant."""
 

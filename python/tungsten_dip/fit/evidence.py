@@ -311,8 +311,7 @@ def _caps(candidates: Sequence[Halves], denominators: Halves, threads: int) -> H
 def _baseline_errors(errors_of_baseline: Halves, caps: Halves, threads: int) -> Halves:
     """Return `Evidence.baseline_errors`."""
     a, b = (
-        # The sums behind a mean around a pixel that is brighter by far cancel to below 0.
-        np.maximum(mean_around(np.minimum(error, cap), _ERROR_RADIUS, threads), 0)
+        mean_around(np.minimum(error, cap), _ERROR_RADIUS, threads)
         for error, cap in zip(errors_of_baseline, caps, strict=True)
     )
     return a, b

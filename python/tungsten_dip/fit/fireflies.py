@@ -199,7 +199,7 @@ def _surroundings(level: _Levels, threads: int) -> FloatImage:
     """Return the mean around every pixel, to which no other pixel adds more than `_LIMIT` times its own."""
     capped = np.minimum(level, _BRIGHTEST).astype(np.float32)
     for _ in range(_ROUNDS):
-        around = np.maximum(mean_around(capped, _RADIUS, threads), 0)
+        around = mean_around(capped, _RADIUS, threads)
         lower = np.minimum(capped, np.float32(_LIMIT) * around)
         if (lower >= np.float32(_SETTLED) * capped).all():
             break

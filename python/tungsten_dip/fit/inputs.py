@@ -17,7 +17,7 @@ from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import Evidence, relative_error
 from tungsten_dip.fit.layout import SCORE_RADII
-from tungsten_dip.fit.neighbours import mean_around
+from tungsten_dip.fit.neighbours import mean_around, signed_mean_around
 
 INPUTS_RADIUS = max(SCORE_RADII)
 
@@ -82,11 +82,11 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
         image = candidate[half]
         if index == 0:
             # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
-            image = np.maximum(mean_around(image, 1, threads), 0)
+            image = mean_around(image, 1, threads)
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
         worse = np.minimum(relative_error(candidate[half], other, denominator), cap) - baseline_error
         for radius in SCORE_RADII:
-            score = mean_around(worse, radius, threads) / unit
+            score = signed_mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]
 
 

@@ -19,7 +19,17 @@ def window_pixels(shape: tuple[int, ...], radius: int) -> FloatImage:
 
 
 def mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
-    """Return the mean of the (2 radius + 1)^2 pixels around each, without it (0 where there is no other)."""
+    """Return the mean of the (2 radius + 1)^2 pixels around each, without it (0 where there is no other).
+
+    ``image`` has shape (height, width, channels) and is never negative, and so is the mean.
+    """
+    # The sums around a pixel that is brighter by far cancel to below 0.
+    mean: FloatImage = np.maximum(signed_mean_around(image, radius, threads), 0)
+    return mean
+
+
+def signed_mean_around(image: FloatImage, radius: int, threads: int) -> FloatImage:
+    """Return the same of an image that may be negative."""
     count = window_pixels(image.shape, radius)
     others: FloatImage = _core.box_mean(image, radius, threads) * count - image
     others /= np.maximum(count - 1, 1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip import _core
 from tungsten_dip.buffers.half_buffers import without_foreign_halves, without_single_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
@@ -16,9 +17,6 @@ from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.splitting import with_lost_halves_drawn
 
 _LOG = logging.getLogger(__name__)
-
-_INFINITE_RADIANCE = np.float32(1e36)
-"""From which on radiance counts as infinite, as in `sanitize`."""
 
 _LARGEST_ALBEDO = 2.0
 """Of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far above."""
@@ -96,7 +94,9 @@ def _without_lost_halves(
 
 def _finite(image: FloatImage) -> npt.NDArray[np.bool_]:
     """Return in which pixels every channel is known, shape (height, width, 1)."""
-    known: npt.NDArray[np.bool_] = np.abs(image).max(axis=2, keepdims=True) < _INFINITE_RADIANCE
+    known: npt.NDArray[np.bool_] = np.abs(image).max(axis=2, keepdims=True) < np.float32(
+        _core.INFINITE_RADIANCE
+    )
     return known
 
 
