@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "python" / "tungsten_dip"
 
 FACES = ("__init__.py", "__main__.py")
-"""Of the package itself: they offer what other layers define."""
+"""Files of the package itself: they offer what other layers define."""
 
 
 def layers() -> list[str]:

@@ -29,7 +29,7 @@ from tungsten_dip.fit.pilots import (
     PilotMaker,
     first_guides,
 )
-from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.preparation import prepare_input
 from tungsten_dip.fit.surfaces import Surfaces, surfaces_of_halves
 from tungsten_dip.fit.training import Training, _batches
 from tungsten_dip.progress import silent
@@ -827,8 +827,8 @@ def test_the_albedo_of_a_picture_full_of_light_is_used(
     for name in ("color", "albedo"):
         planes = getattr(render.buffers, name).planes()
         buffers[name] = Buffer(**{plane: np.where(lit, np.float32(radiance), x) for plane, x in planes})
-    known = prepared(render.buffers.with_quantities(**buffers), 1)
-    assert known.buffers.albedo is not None
+    prepared = prepare_input(render.buffers.with_quantities(**buffers), 1)
+    assert prepared.buffers.albedo is not None
     assert not caplog.text
 
 
@@ -844,7 +844,7 @@ def test_an_albedo_that_may_be_in_its_scale_is_used(
     radiance: float, albedo: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     color, feature = (Buffer(np.full((1, 1, 3), value, np.float32)) for value in (radiance, albedo))
-    assert prepared(RenderBuffers(color, feature), 1).buffers.albedo is not None
+    assert prepare_input(RenderBuffers(color, feature), 1).buffers.albedo is not None
     assert "albedo" not in caplog.text
 
 

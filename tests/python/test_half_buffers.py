@@ -12,7 +12,7 @@ from fitted_models import DRAFT, check_result
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.preparation import prepare_input
 
 
 @pytest.mark.parametrize("spoil", ["sums", "another picture", "little of another layer"])
@@ -140,13 +140,13 @@ def test_lamps_beside_what_one_half_lost_stay_in_both_halves(render: SyntheticRe
         changed[quantity] = Buffer(**planes)
     lamp = changed["color"]
     lamp.mean[20:30, 20:40] = lamp.half_a[20:30, 20:40] = np.nan
-    known = prepared(render.buffers.with_quantities(**changed), 1).buffers
-    assert known.color.halves is not None
+    prepared = prepare_input(render.buffers.with_quantities(**changed), 1).buffers
+    assert prepared.color.halves is not None
     whole = np.ones(color.mean.shape[:2], bool)
     whole[20:30, 20:40] = False
-    for half, before in zip(known.color.halves, changed["color"].halves, strict=True):
+    for half, before in zip(prepared.color.halves, changed["color"].halves, strict=True):
         np.testing.assert_array_equal(half[whole], before[whole])
-    np.testing.assert_allclose(sum(known.color.halves)[~whole] / 2, lamp.half_b[~whole], rtol=1e-5)
+    np.testing.assert_allclose(sum(prepared.color.halves)[~whole] / 2, lamp.half_b[~whole], rtol=1e-5)
 
 
 def test_an_image_of_one_half_alone_is_one_without_halves(render: SyntheticRender) -> None:
@@ -185,9 +185,11 @@ def test_a_half_whose_other_half_is_missing_is_left_aside_with_a_note(
 ) -> None:
     buffer = getattr(render.buffers, quantity)
     single = render.buffers.with_quantities(**{quantity: replace(buffer, **{missing: None})})
-    known = prepared(single, 1)
+    prepared = prepare_input(single, 1)
     letter = missing[-1].upper()
-    assert any(f"{quantity}: half buffer" in note and f"{letter} is missing" in note for note in known.notes)
-    left = getattr(known.buffers, quantity)
+    assert any(
+        f"{quantity}: half buffer" in note and f"{letter} is missing" in note for note in prepared.notes
+    )
+    left = getattr(prepared.buffers, quantity)
     assert left.half_a is None
     assert left.half_b is None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.fit.paper.images import paper_images
-from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.preparation import prepare_input
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 
@@ -43,7 +43,7 @@ def paper_curve(
     sampling_s = 0.0
     points = []
     total = max(checkpoints)
-    buffers = prepared(buffers, settings.threads).buffers
+    buffers = prepare_input(buffers, settings.threads).buffers
     with compute_device(settings) as device:
         fit = PaperFit(paper_images(buffers, settings), settings, device)
         for iteration in range(1, total + 1):

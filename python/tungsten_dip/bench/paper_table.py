@@ -25,7 +25,7 @@ from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
 from tungsten_dip.fit.paper.images import paper_images
-from tungsten_dip.fit.preparation import prepared
+from tungsten_dip.fit.preparation import prepare_input
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.progress import Progress, silent
 
@@ -129,7 +129,7 @@ def run_paper_table(
         whole_number("rows", number, 1, len(published))
     iterations = whole_number("iterations", iterations, 1, MOST_ITERATIONS)
     runner = Runner(folder, threads)
-    buffers = prepared(bench_set.buffers, threads).buffers
+    buffers = prepare_input(bench_set.buffers, threads).buffers
     chosen = [
         row
         for row in published

@@ -26,10 +26,10 @@ Halves = tuple[FloatImage, FloatImage]
 """An image made only of half A of the samples, and one of the same shape made only of half B."""
 
 FloatArray = npt.NDArray[np.float32]
-"""Of any shape that is not an image's."""
+"""Numbers of any shape that is not an image's."""
 
 Indices = npt.NDArray[np.int64]
-"""Of pixels, counted row by row."""
+"""Indices of pixels, counted row by row."""
 
 Quantity = Literal["color", "albedo", "normal", "depth", "visibility"]
 

@@ -8,7 +8,7 @@ from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import check_type
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
-from tungsten_dip.fit.preparation import completed, prepared
+from tungsten_dip.fit.preparation import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import deferred_interrupts
@@ -68,15 +68,15 @@ def denoise(
         settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
     check_type("settings", settings, FitSettings, "use FitSettings(preset=...)")
     check_ready(settings, warm_start)
-    known = prepared(buffers, settings.threads)
+    prepared = prepare_input(buffers, settings.threads)
     if settings.preset == "paper":
         with deferred_interrupts():
             from tungsten_dip.fit.paper.fit import fit_paper
 
-        result = fit_paper(known.buffers, settings, progress, warm_start)
+        result = fit_paper(prepared.buffers, settings, progress, warm_start)
     else:
         with deferred_interrupts():
             from tungsten_dip.fit.blending import fit_blend
 
-        result = fit_blend(known.buffers, settings, progress, warm_start)
-    return completed(result, known)
+        result = fit_blend(prepared.buffers, settings, progress, warm_start)
+    return finish_result(result, prepared)

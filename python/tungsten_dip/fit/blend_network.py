@@ -33,7 +33,7 @@ ADAM_EPSILON = 1e-8
 _HEAD_START = 1.0
 """Logit that the best single pilot starts with."""
 
-_LARGEST_ERROR = 30.0
+_HUBER_THRESHOLD = 30.0
 """A pixel's weighted error that pulls no harder however much larger it is (Huber 1964): a hundred pixels that
 one half's samples found by chance would teach the network all it learns."""
 
@@ -233,69 +233,69 @@ class _Step(GraphBuilder):
     def forward(self, shapes: dict[str, tuple[int, ...]]) -> dict[str, str]:
         """Compute the candidates' means, ``blended`` (3, M); return them, and what the gradients need."""
         sizes = [int(np.prod(shape)) for shape in shapes.values()]
-        known: dict[str, str] = {}
+        values: dict[str, str] = {}
         for (name, shape), part in zip(shapes.items(), self.split("weights", sizes), strict=True):
             as_column = self.integers(*shape) if len(shape) == 2 else self.integers(-1, 1)
-            known[name] = self.add("Reshape", part, as_column)
+            values[name] = self.add("Reshape", part, as_column)
         x = "inputs"
         for layer in (1, 2, 3):
-            known[f"input{layer}"] = x
-            weight, bias = known[f"layer{layer}.weight"], known[f"layer{layer}.bias"]
+            values[f"input{layer}"] = x
+            weight, bias = values[f"layer{layer}.weight"], values[f"layer{layer}.bias"]
             # Pixels are rows in the inputs, and columns from then on.
             x = self.add("Gemm", weight, x, bias, transB=int(layer == 1))
             if layer < 3:
-                x = known[f"output{layer}"] = self.add("LeakyRelu", x, alpha=LEAKY_SLOPE)
+                x = values[f"output{layer}"] = self.add("LeakyRelu", x, alpha=LEAKY_SLOPE)
         # onnxruntime's softmax over the first axis crawls, and so do products of a matrix for every pixel.
         exp = self.add("Exp", self.add("Sub", x, self.add("ReduceMax", x, self.integers(0))))
-        known["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
+        values["shares"] = self.add("Div", exp, self.add("ReduceSum", exp, self.integers(0)))
         count = shapes["layer3.bias"][0]
         in_rows = self.add("Reshape", "candidates", self.integers(-1, 3 * count))
         flat = self.add("Transpose", in_rows, perm=[1, 0])
-        known["candidates"] = self.add("Reshape", flat, self.integers(count, 3, -1))
+        values["candidates"] = self.add("Reshape", flat, self.integers(count, 3, -1))
         shared = self.add(
-            "Mul", known["candidates"], self.add("Unsqueeze", known["shares"], self.integers(1))
+            "Mul", values["candidates"], self.add("Unsqueeze", values["shares"], self.integers(1))
         )
-        known["blended"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
-        return known
+        values["blended"] = self.add("ReduceSum", shared, self.integers(0), keepdims=0)
+        return values
 
     def gradient(self, shapes: dict[str, tuple[int, ...]]) -> str:
         """Compute ``loss`` and return its derivatives by the weights, as one vector.
 
-        Of pixels whose error exceeds `_LARGEST_ERROR`, the derivatives are those of Huber's loss.
+        Of pixels whose error exceeds `_HUBER_THRESHOLD`, the derivatives are those of Huber's loss.
         """
-        known = self.forward(shapes)
+        values = self.forward(shapes)
         target, weight = (self.add("Transpose", name, perm=[1, 0]) for name in ("target", "weight"))
-        difference = self.add("Sub", known["blended"], target)
+        difference = self.add("Sub", values["blended"], target)
         weighted = self.add("Mul", difference, weight)
         squared = self.add("ReduceMean", self.add("Mul", weighted, difference), self.integers(0))
-        error, most = self.add("Sqrt", squared), self.number(_LARGEST_ERROR)
+        error, most = self.add("Sqrt", squared), self.number(_HUBER_THRESHOLD)
         bounded = self.add("Min", error, most)
         beyond = self.add("Sub", self.add("Add", error, error), bounded)
         self.add("ReduceMean", self.add("Mul", bounded, beyond), keepdims=0, output="loss")
 
-        # loss = mean over pixels of e^2, beyond m of 2 m e - m^2, where m is `_LARGEST_ERROR` and
+        # loss = mean over pixels of e^2, beyond m of 2 m e - m^2, where m is `_HUBER_THRESHOLD` and
         # e^2 = mean over channels of weight * difference^2
         count = self.add("Cast", self.add("Size", "target"), to=onnx.TensorProto.FLOAT)
         pull = self.add("Div", most, self.add("Max", error, most))
         twice = self.add("Mul", pull, self.add("Div", self.number(2), count))
         by_blended = self.add("Mul", weighted, twice)
         by_share = self.add(
-            "ReduceSum", self.add("Mul", known["candidates"], by_blended), self.integers(1), keepdims=0
+            "ReduceSum", self.add("Mul", values["candidates"], by_blended), self.integers(1), keepdims=0
         )
         # softmax: share * (derivative - mean of the derivatives by shares)
-        mean = self.add("ReduceSum", self.add("Mul", known["shares"], by_share), self.integers(0))
-        by_output = self.add("Mul", known["shares"], self.add("Sub", by_share, mean))
+        mean = self.add("ReduceSum", self.add("Mul", values["shares"], by_share), self.integers(0))
+        by_output = self.add("Mul", values["shares"], self.add("Sub", by_share, mean))
 
         flat = self.integers(-1)
         parts: dict[str, str] = {}
         for layer in (3, 2, 1):
-            by_weight = self.add("Gemm", by_output, known[f"input{layer}"], transB=int(layer > 1))
+            by_weight = self.add("Gemm", by_output, values[f"input{layer}"], transB=int(layer > 1))
             parts[f"layer{layer}.weight"] = self.add("Reshape", by_weight, flat)
             parts[f"layer{layer}.bias"] = self.add("ReduceSum", by_output, self.integers(1), keepdims=0)
             if layer > 1:
-                by_input = self.add("Gemm", known[f"layer{layer}.weight"], by_output, transA=1)
+                by_input = self.add("Gemm", values[f"layer{layer}.weight"], by_output, transA=1)
                 # A leaky ReLU keeps the sign.
-                falls = self.add("Less", known[f"output{layer - 1}"], self.number(0))
+                falls = self.add("Less", values[f"output{layer - 1}"], self.number(0))
                 slope = self.add("Where", falls, self.number(LEAKY_SLOPE), self.number(1))
                 by_output = self.add("Mul", by_input, slope)
         return self.add("Concat", *(parts[name] for name in shapes), axis=0, output="gradient")

@@ -40,11 +40,11 @@ _LARGE_RADIUS = 18
 
 _BATCH_PIXELS = 1 << 14
 _SMALL_BATCH_PIXELS = 1 << 13
-"""Enough for the pilots of draft, and beside a previous frame; with more of them the rims of lamps, few
-pixels, come out worse."""
+"""Pixels of a step, at most. The small batch is enough for the pilots of draft, and beside a previous frame;
+with more of them the rims of lamps, few pixels, come out worse."""
 
 _STEPS_OF_ONE = 240
-"""Of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
+"""Steps of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
 
 _POLL_S = 0.1
 

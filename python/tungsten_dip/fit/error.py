@@ -24,7 +24,7 @@ _CONFIDENCE = 4.0
 _SURE = 0.35
 """Relative standard error of an estimate up to which it is used."""
 
-_LARGEST_ERROR = 1e30
+_OVERFLOW_BOUND = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
@@ -53,8 +53,8 @@ def estimate_error(candidates: Sequence[Halves], scale: float, denoised: Halves)
                 channel_mean((mean_of((a[part], b[part])) - output[part]) ** 2 * relative)[:, 0]
                 for a, b in computed
             ]
-            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _LARGEST_ERROR)
-            apart_squared = np.minimum(np.median(apart, axis=0), _LARGEST_ERROR)
+            variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _OVERFLOW_BOUND)
+            apart_squared = np.minimum(np.median(apart, axis=0), _OVERFLOW_BOUND)
         # The root of each: their product would overflow.
         bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
     estimated, standard_error = error_from_halves(candidates[0], denoised, epsilon)
@@ -119,7 +119,7 @@ def bounded_ratio(
 ) -> npt.NDArray[Any]:
     """Return squared errors relative to a denominator, bounded so that they can be summed."""
     with np.errstate(over="ignore"):
-        return np.clip(squared / denominator, -_LARGEST_ERROR, _LARGEST_ERROR)
+        return np.clip(squared / denominator, -_OVERFLOW_BOUND, _OVERFLOW_BOUND)
 
 
 def epsilon_of_renderer(scale: float) -> np.float32:

@@ -55,7 +55,7 @@ _BAND_ROWS = 64
 
 _PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
-"""Of a time budget, after which no further pilot, or none of draft's, begins; the rest is the training's."""
+"""Parts of a time budget after which no further pilot, or none of draft's, begins. Training gets the rest."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ def evidence_from_buffers(
         _check_fits(layout, surfaces[0], len(extra_pilots) + (previous is not None))
 
     occupied = _occupied(halves, buffers, threads)
-    guides, known, filled = _guides(halves, surfaces, previous, scale, occupied)
+    guides, already_computed, filled = _guides(halves, surfaces, previous, scale, occupied)
     maker = PilotMaker(halves, surfaces, guides, previous=filled)
     budget = clock if layout is None else Clock()
-    computed = _computed(maker, pilots, known, occupied, budget, progress)
+    computed = _computed(maker, pilots, already_computed, occupied, budget, progress)
     if filled is not None:
         extra_pilots.append(filled)
 
@@ -200,19 +200,20 @@ def _guides(
 def _computed(
     maker: PilotMaker,
     pilots: Sequence[Pilot],
-    known: dict[Pilot, Halves],
+    already_computed: dict[Pilot, Halves],
     occupied: FloatImage,
     clock: Clock,
     progress: Progress,
 ) -> list[Halves]:
-    """Compute the pilots that are not ``known``, the first always, others while the time budget allows."""
+    """Return all pilots, but those that the time budget does not allow any more; the first it always does."""
     computed: list[Halves] = []
     for index, pilot in enumerate(pilots):
         progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE
         if index > 0 and clock.share_spent() > share:
             break
-        computed.append(known[pilot] if pilot in known else _masked(maker.images(pilot), occupied))
+        images = already_computed.get(pilot)
+        computed.append(images or _masked(maker.images(pilot), occupied))
     return computed
 
 

@@ -50,7 +50,7 @@ _BRIGHTEST = 1e30
 _MOST_RETURNED = 60.0
 """No firefly gives back more than so many times the radiance around it: few hold most of what is removed."""
 
-_SURELY = 3.0
+_STANDARD_ERRORS = 3.0
 """So many standard errors are subtracted from what is given back."""
 
 _LARGEST_GAIN = 1.5
@@ -185,7 +185,7 @@ def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
     pixels = window_pixels(taken[0].shape, radius)
     mean = _core.box_mean(mean_of((taken[0], taken[1])), radius, threads)
     squares = _core.box_mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
-    certain = np.maximum(mean - np.float32(_SURELY) * np.sqrt(squares / pixels), 0)
+    certain = np.maximum(mean - np.float32(_STANDARD_ERRORS) * np.sqrt(squares / pixels), 0)
     a, b = (channel_mean(half) for half in halves)
     level = _core.box_mean(mean_of((a, b)), _RADIUS, threads)
     noise = _core.box_mean(np.abs(a - b), _RADIUS, threads)

@@ -22,7 +22,7 @@ _OCTAVES = np.arange(0, 4.5, 0.5)
 _FEW = 6
 """From fewer pixels no slope is estimated: with heavy-tailed noise their standard error is too small."""
 
-_SURELY = 2.0
+_STANDARD_ERRORS = 2.0
 """So many standard errors are subtracted from a slope."""
 
 _BLACK = 2e-3
@@ -79,7 +79,7 @@ def _sure_slopes(octaves_apart: FloatImage, p: _Floats, q: _Floats) -> _Floats:
     total = np.maximum(sum_beyond(q), 1e-30)
     slopes = sum_beyond(p) / total
     residuals = sum_beyond(p**2) - 2 * slopes * sum_beyond(p * q) + slopes**2 * sum_beyond(q**2)
-    sure = np.clip(slopes - _SURELY * np.sqrt(np.maximum(residuals, 0)) / total, 0, 1)
+    sure = np.clip(slopes - _STANDARD_ERRORS * np.sqrt(np.maximum(residuals, 0)) / total, 0, 1)
     sure[sum_beyond(np.ones_like(q)) < _FEW] = 0
     sure[0] = 0
     # What is certain of some pixels holds for those yet farther apart.

@@ -17,7 +17,7 @@ from tungsten_dip.fit.settings import NETWORK_SETTINGS, PAPER_SETTINGS, FitSetti
 from tungsten_dip.fit.standardisation import Standardisation
 
 Weights = dict[str, npt.NDArray[np.float32]]
-"""By name. Those of convolutions have shape (outputs, inputs, height, width)."""
+"""Weights by name. Those of convolutions have shape (outputs, inputs, height, width)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ from tungsten_dip.fit.splitting import with_lost_halves_drawn
 _LOG = logging.getLogger(__name__)
 
 _LARGEST_ALBEDO = 2.0
-"""Of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far above."""
+"""Albedo of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far
+above."""
 
 _SEEN_LIGHT = np.float32(1 / 3)
 """Part of a lamp's radiance that the colour contains at least; fog or a lens that darkens takes the rest."""
@@ -36,7 +37,7 @@ class Prepared:
     notes: tuple[str, ...]
 
 
-def prepared(buffers: RenderBuffers, threads: int | None) -> Prepared:
+def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
     """Check and sanitise the input, without an albedo in another scale, with halves for those that are lost.
 
     Raises InputError if these are no buffers or the image is empty.
@@ -93,11 +94,10 @@ def _without_lost_halves(
 
 
 def _finite(image: FloatImage) -> npt.NDArray[np.bool_]:
-    """Return in which pixels every channel is known, shape (height, width, 1)."""
-    known: npt.NDArray[np.bool_] = np.abs(image).max(axis=2, keepdims=True) < np.float32(
-        _core.INFINITE_RADIANCE
-    )
-    return known
+    """Return in which pixels every channel is finite, shape (height, width, 1)."""
+    largest = np.abs(image).max(axis=2, keepdims=True)
+    finite: npt.NDArray[np.bool_] = largest < np.float32(_core.INFINITE_RADIANCE)
+    return finite
 
 
 def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
@@ -121,17 +121,17 @@ def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
     return buffers.with_quantities(albedo=None)
 
 
-def completed(result: FitResult, known: Prepared) -> FitResult:
+def finish_result(result: FitResult, prepared: Prepared) -> FitResult:
     """Return the result with the notes on its input before its own, all of which are logged.
 
     Where alpha and colour of the input are 0 the result is black: radiance without coverage would glow around
     the image that it is composited over.
     """
-    result = replace(result, notes=(*known.notes, *result.notes))
+    result = replace(result, notes=(*prepared.notes, *result.notes))
     for note in result.notes:
         _LOG.info(note)
-    alpha = known.buffers.alpha
+    alpha = prepared.buffers.alpha
     if alpha is None:
         return result
-    empty = (alpha <= 0) & (known.buffers.color.mean == 0).all(axis=2, keepdims=True)
+    empty = (alpha <= 0) & (prepared.buffers.color.mean == 0).all(axis=2, keepdims=True)
     return replace(result, color=np.where(empty, np.float32(0), result.color))

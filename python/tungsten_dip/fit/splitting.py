@@ -28,7 +28,7 @@ _Plane = npt.NDArray[np.float64]
 
 _MEAN_RADIUS = 2
 _NOISE_RADIUS = 1
-"""Of the windows of the mean that a pixel differs from, and of the mean squared difference."""
+"""Radii of the windows of the mean that a pixel differs from, and of the mean squared difference."""
 
 _CORRELATION_RADIUS = 8
 
@@ -36,7 +36,7 @@ _LEAST_SHAPE = 1e-2
 _SHAPE_OF_ONE_SAMPLE = 0.07
 """One half has all of such a pixel, in every channel: a single sample was so bright."""
 
-_STRAY = 8 / 3
+_STRAY_OVER_NEIGHBOURS = 8 / 3
 """Emission of more than so many times the mean of the 8 pixels around was hit by chance: a lamp's corner has
 three lit neighbours."""
 
@@ -168,7 +168,9 @@ def _lamps(light: FloatImage, threads: int) -> tuple[npt.NDArray[np.bool_], Floa
     Their edges are mistaken for noise, but no half may be without them. ``light`` is their emission, shape
     (height, width, 1).
     """
-    lit = ((light > 0) & (light <= np.float32(_STRAY) * mean_around(light, 1, threads)))[:, :, 0]
+    lit = ((light > 0) & (light <= np.float32(_STRAY_OVER_NEIGHBOURS) * mean_around(light, 1, threads)))[
+        :, :, 0
+    ]
     return lit, np.where(lit, _least_shape_of_lamps(light)[:, :, 0], 0)
 
 

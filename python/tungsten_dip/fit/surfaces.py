@@ -23,7 +23,7 @@ _ALBEDO_PENALTY = 20.0
 _DEPTH_PENALTY = 0.14
 _DEPTH_SCALE = 18.0
 
-_LEAST_ALBEDO = 0.01
+_ALBEDO_OFFSET = 0.01
 """Added to the albedo that divides the colour, so that dark surfaces keep their noise finite."""
 
 _BLACK_ALBEDO = 1e-3
@@ -44,7 +44,7 @@ _MOST_SMEARED = 4.0
 """Smoothed emission is at most so many times a pixel's own or that of the third brightest of the 3x3 pixels
 around it: beside the straight edge of a lamp three are lit, beside a lamp of few pixels, or the sun, less."""
 
-_STRAY = 4.0
+_STRAY_OVER_OTHER_HALF = 4.0
 _STRAY_AROUND = 0.6
 """Emission of one half was hit by chance beyond so many times the other half's, or that of all other pixels
 of both halves' 3x3, in which two about as bright thus suffice."""
@@ -247,7 +247,7 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     both = emissions[0] + emissions[1]
     around = window_pixels(both.shape, 1) * _core.box_mean(both, 1, threads)
     kept_a, kept_b = (
-        np.minimum(half, 1 + np.maximum(_STRAY * other, _STRAY_AROUND * (around - own)))
+        np.minimum(half, 1 + np.maximum(_STRAY_OVER_OTHER_HALF * other, _STRAY_AROUND * (around - own)))
         for half, own, other in zip(albedo.halves, emissions, emissions[::-1], strict=True)
     )
     taken = mean_of((albedo.halves[0] - kept_a, albedo.halves[1] - kept_b))
@@ -289,7 +289,7 @@ def _feature_channels(
 def divisor(albedo: FloatImage) -> FloatImage:
     """Return the albedo by which the colour is divided, shape (height, width, 3), never 0."""
     black = channel_mean(albedo) < _BLACK_ALBEDO
-    return np.where(black, np.float32(1), albedo + np.float32(_LEAST_ALBEDO))
+    return np.where(black, np.float32(1), albedo + np.float32(_ALBEDO_OFFSET))
 
 
 def along_edges(image: FloatImage, edges: FloatImage, radius: float, threads: int) -> FloatImage:

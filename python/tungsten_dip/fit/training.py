@@ -28,7 +28,8 @@ LEARNING_RATE = 1e-2
 _WARM_UP_STEPS = 10
 _POOL_PIXELS = 1 << 17
 _POOL_PASSES = 4
-"""So many pixels are drawn at a time, and used so often: to draw one takes half as long as to train on it."""
+"""Pixels that are drawn at a time, and how often they are used: to draw one takes half as long as to train on
+it."""
 
 _LEAST_BATCH = 64
 _LEAST_COUNT = 1 << 12
@@ -52,7 +53,7 @@ _WARM_RATE = 0.3
 _WARM_HISTORY_EVERY = 5
 _WARM_PATIENCE = 3
 _WARM_GAIN = 0.01
-"""It is done once this many estimates in a row have not lowered the error by this part."""
+"""Training ends once so many estimates in a row have not lowered the error by this part."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from tungsten_dip.onnx.graph import graph_of
 
 LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
-"""Of all but the weights: bounds the memory of the parser."""
+"""Size of all but the weights: bounds the memory of the parser."""
 
 _FORMAT = 8
 """Raised whenever another graph is written, or the same one has other inputs."""

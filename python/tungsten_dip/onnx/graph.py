@@ -29,7 +29,7 @@ from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
 _MOST_MEMBERS = 16
-"""Of a blend network: the memory that it takes grows with them."""
+"""Members of a blend network: the memory that it takes grows with them."""
 
 
 def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.ModelProto:

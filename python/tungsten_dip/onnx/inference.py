@@ -20,7 +20,7 @@ from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
-from tungsten_dip.fit.preparation import completed, prepared
+from tungsten_dip.fit.preparation import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
@@ -52,14 +52,14 @@ def infer(
     """
     check_type("model", model, Model, "load_model reads one from a file")
     settings = inference_settings(model, threads, refit_steps)
-    known = prepared(buffers, threads)
+    prepared = prepare_input(buffers, threads)
     if model.layout is None:
-        result = _infer_paper(model, known.buffers, settings, progress)
+        result = _infer_paper(model, prepared.buffers, settings, progress)
     elif refit_steps:
-        result = fit_blend(known.buffers, settings, progress, model, refit_steps=refit_steps)
+        result = fit_blend(prepared.buffers, settings, progress, model, refit_steps=refit_steps)
     else:
-        result = infer_blend(model, known.buffers, settings, progress)
-    return completed(result, known)
+        result = infer_blend(model, prepared.buffers, settings, progress)
+    return finish_result(result, prepared)
 
 
 def inference_settings(model: Model, threads: int | None, refit_steps: int) -> FitSettings:

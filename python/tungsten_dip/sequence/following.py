@@ -21,7 +21,7 @@ from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.preparation import completed, prepared
+from tungsten_dip.fit.preparation import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.surfaces import alpha_as_albedo
@@ -37,14 +37,14 @@ Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
 
 _MOST_STEPS = 240
-"""Of a network that is trained further, and of a new one for frames that follow: as many as one network by
-itself needs (`fit.blending`)."""
+"""Steps of a network that is trained further, and of a new one for frames that follow: as many as one network
+by itself needs (`fit.blending`)."""
 
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
 
 _ALBEDO_PASSES = ((3, 1, 0.5),)
-"""Of the pre-filter, enough to tell surfaces apart and to part light from them."""
+"""Passes of the pre-filter, enough to tell surfaces apart and to part light from them."""
 
 _CUT_ERROR = 5.0
 """An error so many times the previous frame's means a cut."""
@@ -119,8 +119,8 @@ class Follower:
         if camera is not None:
             check_camera(camera, buffers)
             self._tell_what_is_missing(buffers)
-        known = prepared(buffers, self._settings.threads)
-        buffers = known.buffers
+        prepared = prepare_input(buffers, self._settings.threads)
+        buffers = prepared.buffers
         smooth = self._with_smooth_albedo(buffers) if camera is not None else buffers
         how: How = "fitted"
         try:
@@ -142,7 +142,7 @@ class Follower:
         if result.model is not None:  # An image without noise, returned as it is, tells nothing of others.
             self._error = _typical_error(result)
         self._last = _Last(buffers, smooth, camera, result)
-        return replace(followed, result=completed(result, known))
+        return replace(followed, result=finish_result(result, prepared))
 
     def _tell_what_is_missing(self, buffers: RenderBuffers) -> None:
         if buffers.depth is None and not self._told_of_depth:

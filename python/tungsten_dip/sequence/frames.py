@@ -15,7 +15,7 @@ _ONE_SIGN = re.compile(r"#|%(\d*)d")
 """Counts only where nothing longer does: folders may be called ``take#2`` or ``50%done``."""
 
 _MOST_FRAMES = 1_000_000
-"""In one range of numbers: they are all held in memory, and more than that is a slip."""
+"""Frames in one range of numbers: they are all held in memory, and more than that is a slip."""
 
 
 @dataclass(frozen=True)

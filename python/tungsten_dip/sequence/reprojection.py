@@ -23,17 +23,18 @@ _DEPTH_TOLERANCE = 0.02
 """Relative difference of distances up to which two pixels show one surface."""
 
 _NORMAL_TOLERANCE = 0.2
-"""In each component: normals may be 11 to 20 degrees apart, as on a curved surface from pixel to pixel."""
+"""Difference in each component: normals may be 11 to 20 degrees apart, as on a curved surface from pixel to
+pixel."""
 
 _ALBEDO_TOLERANCE = 0.1
-"""Of the larger of 1 and the albedo (a light's is its radiance)."""
+"""Difference relative to the larger of 1 and the albedo (a light's is its radiance)."""
 
-_LEAST_ALBEDO = np.float32(0.02)
+_MOVED_ALBEDO_OFFSET = np.float32(0.02)
 """Added to the albedos that light is moved without, on black surfaces too: what one frame divides by another
 number than the next one multiplies by would light up at their edges."""
 
 _LEAST_WEIGHT = 0.25
-"""Of the four pixels around a point, in total; less is the rim of a surface."""
+"""Weight of the four pixels around a point, in total; less is the rim of a surface."""
 
 
 def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
@@ -197,7 +198,7 @@ def _divisors(buffers: RenderBuffers) -> tuple[FloatImage | np.float32, ...]:
     albedo = buffers.albedo
     if albedo is None:
         return np.float32(1), np.float32(1)
-    return tuple(image + _LEAST_ALBEDO for image in albedo.halves_or_mean)
+    return tuple(image + _MOVED_ALBEDO_OFFSET for image in albedo.halves_or_mean)
 
 
 def _rotation(camera: Camera) -> npt.NDArray[np.float64]:

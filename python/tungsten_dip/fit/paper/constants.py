@@ -4,7 +4,7 @@ From the published code; ``docs/method.md`` states the method whole.
 """
 
 ITERATIONS = 3000
-"""Of a fit."""
+"""Iterations of a fit."""
 
 LEAKY_SLOPE = 0.2
 """Slope of the leaky ReLU below zero."""
@@ -13,7 +13,7 @@ NORM_EPSILON = 1e-5
 """Added to the variance that a batch norm divides by (PyTorch's default)."""
 
 SIDE_CHANNELS = 4
-"""Of each of Skip's connections across, at the coarsest `SIDE_SCALES` scales."""
+"""Channels of each of Skip's connections across, at the coarsest `SIDE_SCALES` scales."""
 
 SIDE_SCALES = 2
 
