@@ -1,4 +1,4 @@
-"""What Ctrl-C does while libraries load, a fit trains or a pass renders."""
+"""What Ctrl-C does while libraries load, a fit trains, a pass renders or a thread waits for another."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 _LOG = logging.getLogger(__name__)
+
+_TURN_S = 0.1
 
 
 def deferred_interrupts() -> AbstractContextManager[None]:
@@ -43,6 +47,15 @@ def interrupts_as_requests(warning: str) -> Iterator[Callable[[], bool]]:
 
     with _on_interrupt(request):
         yield lambda: requested
+
+
+def wait_in_short_turns(pending: Future[Any], between: Callable[[], None] = lambda: None) -> None:
+    """Wait until another thread has finished, and call ``between`` after every turn.
+
+    A Ctrl-C just before a single wait would be noticed at its end only.
+    """
+    while not wait([pending], timeout=_TURN_S).done:
+        between()
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender, relmse
 from fitted_models import check_result
+from tungsten_dip import interrupts
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
@@ -395,6 +396,7 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
     check_result(result, render.buffers)
     assert told == [True]
     assert result.interrupted
+    assert any(note.endswith("the image is made of the halves alone") for note in result.notes)
 
 
 def test_strands_before_nothing_are_found_by_alpha() -> None:
@@ -427,8 +429,9 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
     waiting, told = Event(), []
 
     def wait_or_interrupt(*arguments: Any, **options: Any) -> Any:
+        first = not waiting.is_set()
         waiting.set()
-        if not waits:
+        if first and not waits:
             signal.raise_signal(signal.SIGINT)
         return wait(*arguments, **options)
 
@@ -440,14 +443,51 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
         told.append(arguments[-1].wait(timeout=60))
         return pilots_of_all_samples(*arguments)
 
-    monkeypatch.setattr(blending, "wait", wait_or_interrupt)
+    monkeypatch.setattr(interrupts, "wait", wait_or_interrupt)
     monkeypatch.setattr(blending, "pilots_of_all_samples", after_training)
     result = denoise(render.buffers, _settings(preset="balanced", threads=2))
     check_result(result, render.buffers)
     assert told == [True, True]
     assert result.interrupted
     assert result.iterations == 30
-    assert "interrupted: the image is made of the halves alone" in result.notes
+    assert "interrupted after the training of 30 steps" in result.notes
+    assert any(note.endswith("the image is made of the halves alone") for note in result.notes)
+
+
+def test_ctrl_c_during_the_training_keeps_complete_pilots_of_all_samples(render: SyntheticRender) -> None:
+    """With one thread they are computed before."""
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("relMSE"):
+            raise KeyboardInterrupt
+
+    settings = _settings(preset="balanced")
+    result = denoise(render.buffers, settings, interrupt)
+    whole = denoise(render.buffers, replace(settings, iterations=1))
+    assert result.interrupted
+    assert result.iterations == 1
+    assert not any("halves alone" in note for note in result.notes)
+    np.testing.assert_array_equal(result.color, whole.color)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_failure_beside_the_training_is_raised_when_it_is_waited_for(
+    threads: int, render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = []
+
+    def fail(*_: Any) -> tuple[FloatImage, ...]:
+        raise InputError("a test's")
+
+    def recorded(*arguments: Any) -> Training:
+        trained.append(arguments)
+        return training.train(*arguments)
+
+    monkeypatch.setattr(blending, "pilots_of_all_samples", fail)
+    monkeypatch.setattr(blending, "train", recorded)
+    with pytest.raises(InputError, match="a test's"):
+        denoise(render.buffers, _settings(preset="balanced", threads=threads))
+    assert len(trained) == threads - 1
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -467,11 +507,17 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
         denoise(render.buffers, _settings(preset="balanced", threads=threads))
 
 
-def test_progress_never_falls_and_ends_at_one(render: SyntheticRender) -> None:
+def test_progress_never_falls_and_ends_at_one(render: SyntheticRender, oidn_images: list[FloatImage]) -> None:
+    oidn_images[:] = render.reference, render.reference
     without_halves = RenderBuffers(Buffer(render.buffers.color.mean))
-    for buffers, target in ((render.buffers, None), (render.buffers, 10.0), (without_halves, None)):
+    for buffers, changes in (
+        (render.buffers, {}),
+        (render.buffers, {"target_error": 10.0}),
+        (render.buffers, {"pilot": "oidn"}),
+        (without_halves, {}),
+    ):
         told: list[float] = []
-        denoise(buffers, _settings(target_error=target), lambda fraction, _, told=told: told.append(fraction))
+        denoise(buffers, _settings(**changes), lambda fraction, _, told=told: told.append(fraction))
         assert told == sorted(told)
         assert told[-1] == 1
 

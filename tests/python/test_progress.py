@@ -14,3 +14,9 @@ def test_parts_of_parts() -> None:
     outer = part_of(lambda fraction, message: told.append((fraction, message)), 0.5, 1, "outer")
     part_of(outer, 0, 0.5, "inner")(0.5, "half")
     assert told == [(0.625, "outer: inner: half")]
+
+
+def test_a_part_without_a_name_leaves_messages_as_they_are() -> None:
+    told: list[tuple[float, str]] = []
+    part_of(lambda fraction, message: told.append((fraction, message)), 0.5, 1)(0.5, "half")
+    assert told == [(0.75, "half")]

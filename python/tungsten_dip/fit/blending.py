@@ -8,10 +8,12 @@ enter the image, whose mean is preserved but for errors so large that the loss b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
+from types import TracebackType
+from typing import Self
 
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
@@ -31,7 +33,9 @@ from tungsten_dip.fit.pilots import (
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.fit.training import Start, Training, start_of_training, train
+from tungsten_dip.fit.stages import stage
+from tungsten_dip.fit.training import start_of_training, train
+from tungsten_dip.interrupts import wait_in_short_turns
 from tungsten_dip.progress import Progress
 
 _LARGE_RADIUS = 18
@@ -45,8 +49,6 @@ with more of them the rims of lamps, few pixels, come out worse."""
 
 _STEPS_OF_ONE = 240
 """Steps of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
-
-_POLL_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,9 @@ def fit_blend(
     ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
     the shape of the colour, NaN where they have no value. They are an extra pilot and a guide, with which
     fewer pilots are needed.
+
+    Ctrl-C during the training or after it ends the fit early. The pilots of all samples are then used if they
+    are complete, else given up: the image is made of the halves alone.
     """
     clock = Clock(settings.time_budget_s)
     unchanged = result_without_noise(buffers, settings, clock, progress)
@@ -107,7 +112,33 @@ def fit_blend(
         settings.device,
         evidence.threads,
     )
-    training, all_samples_pilots = _trained(network, start, halved.buffers, settings, preset, clock, progress)
+
+    def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
+        if not preset.all_samples:
+            return ()
+        return pilots_of_all_samples(evidence, halved.buffers, settings, clock, given_up)
+
+    # Each network keeps one core busy; the pilots of all samples take what is left of all of them.
+    with _AllSamplesPilots(pilots_beside) as beside:
+        if evidence.threads == 1:
+            beside.wait()
+        steps = settings.iterations or preset.steps
+        training = train(
+            network, start, settings, steps, preset.batch_pixels, clock, stage(progress, "training")
+        )
+        try:
+            if training.interrupted:
+                beside.give_up()
+            beside.wait()
+        except KeyboardInterrupt:
+            beside.give_up()
+            training.interrupted = True
+            training.notes.append(f"interrupted after the training of {training.steps_done} steps")
+        all_samples_pilots = beside.result()
+    if training.interrupted and preset.all_samples and not all_samples_pilots:
+        training.notes.append(
+            "the pilots of all samples were not complete: the image is made of the halves alone"
+        )
     inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
     denoised, all_samples_blend = blended_images(network, inputs, evidence, all_samples_pilots)
     result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)
@@ -160,49 +191,42 @@ def _pilots(
     return (*DRAFT_PILOTS, *(pilot for pilot in pilots if pilot not in DRAFT_PILOTS))
 
 
-def _trained(
-    network: BlendNetwork,
-    start: Start,
-    buffers: RenderBuffers,
-    settings: FitSettings,
-    preset: _Preset,
-    clock: Clock,
-    progress: Progress,
-) -> tuple[Training, tuple[FloatImage, ...]]:
-    """Train the network and compute the preset's pilots of all samples meanwhile; return both.
+class _AllSamplesPilots:
+    """The pilots of all samples, computed in a thread of its own from entering on.
 
-    Ctrl-C ends both early, then without pilots.
+    Leaving waits for the thread; an error gives its work up before.
     """
-    given_up = Event()
-    training: Training | None = None
-    # Each network keeps one core busy; the pilots of all samples take what is left of all of them.
-    with ThreadPoolExecutor(1) as beside:
-        if preset.all_samples:
-            pending = beside.submit(pilots_of_all_samples, start.evidence, buffers, settings, clock, given_up)
-        else:
-            pending = beside.submit(tuple)
-        try:
-            if start.evidence.threads == 1:
-                _wait_for(pending)
-            steps = settings.iterations or preset.steps
-            training = train(network, start, settings, steps, preset.batch_pixels, clock, progress)
-            if training.interrupted:
-                given_up.set()
-            _wait_for(pending)
-        except BaseException as error:
-            given_up.set()
-            if training is None or not isinstance(error, KeyboardInterrupt):
-                raise
-            training.interrupted = True
-            training.notes.append("interrupted: the image is made of the halves alone")
-            return training, ()
-    return training, pending.result()
 
+    def __init__(self, compute: Callable[[Event], tuple[FloatImage, ...]]) -> None:
+        """``compute`` returns them, or none soon after its argument is set."""
+        self._compute = compute
+        self._given_up = Event()
+        self._thread = ThreadPoolExecutor(1)
 
-def _wait_for(pending: Future[tuple[FloatImage, ...]]) -> None:
-    """Wait in short turns: a Ctrl-C just before a wait would be noticed at its end only."""
-    while not wait([pending], timeout=_POLL_S).done:
-        pass
+    def __enter__(self) -> Self:
+        self._pending = self._thread.submit(self._compute, self._given_up)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self.give_up()
+        self._thread.shutdown()
+
+    def give_up(self) -> None:
+        """Do without them unless they are complete."""
+        self._given_up.set()
+
+    def wait(self) -> None:
+        """Wait for them. Raises the error of their computation."""
+        wait_in_short_turns(self._pending)
+        self._pending.result()
+
+    def result(self) -> tuple[FloatImage, ...]:
+        """Wait for them and return them, none if they were given up. Raises as `wait`."""
+        self.wait()
+        return self._pending.result()
 
 
 def blended_images(

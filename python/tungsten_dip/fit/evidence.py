@@ -37,6 +37,7 @@ from tungsten_dip.fit.pilots import (
 )
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import HalvedImage
+from tungsten_dip.fit.stages import stage
 from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
 from tungsten_dip.progress import Progress
 
@@ -138,12 +139,12 @@ def evidence_from_buffers(
     mean, limited = _without_fireflies(buffers, scale, threads)
     halves = limited.halves
     surfaces = surfaces_of_halves(buffers, halves, scale, threads)
-    progress(0.1, "features")
+    stage(progress, "features")(1.0, "features")
     extra_pilots: list[Halves] = []
     if settings.pilot == "oidn":
         a, b = oidn_pilot(buffers, halves, scale, threads)
         extra_pilots.append((a, b))
-        progress(0.15, "Open Image Denoise")
+        stage(progress, "extra pilots")(1.0, "Open Image Denoise")
     if layout is not None:
         _check_fits(layout, surfaces[0], len(extra_pilots) + (previous is not None))
 
@@ -151,7 +152,7 @@ def evidence_from_buffers(
     guides, already_computed, filled = _guides(halves, surfaces, previous, scale, occupied)
     maker = PilotMaker(halves, surfaces, guides, previous=filled)
     budget = clock if layout is None else Clock()
-    computed = _computed(maker, pilots, already_computed, occupied, budget, progress)
+    computed = _computed(maker, pilots, already_computed, occupied, budget, stage(progress, "pilots"))
     if filled is not None:
         extra_pilots.append(filled)
 
@@ -208,7 +209,7 @@ def _computed(
     """Return all pilots, but those that the time budget does not allow any more; the first it always does."""
     computed: list[Halves] = []
     for index, pilot in enumerate(pilots):
-        progress(0.1 + 0.6 * index / len(pilots), f"pilot {index + 1}")
+        progress(index / len(pilots), f"pilot {index + 1}")
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else _PILOTS_SHARE
         if index > 0 and clock.share_spent() > share:
             break

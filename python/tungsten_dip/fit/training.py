@@ -236,7 +236,7 @@ def train(
                 continue
             error, held_out = probe.errors(network)
             done.history.append(HistoryPoint(clock.seconds(), step, error))
-            progress(0.75 + 0.25 * step / steps, f"relMSE {error:.4g}")
+            progress(step / steps, f"relMSE {error:.4g}")
             if stopping is not None:
                 stopping.record(step, held_out, network)
             reason = _reason_to_stop(error, settings, clock, stopping)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
 from tungsten_dip.hosts.options import checked_option
+from tungsten_dip.interrupts import wait_in_short_turns
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.types import Scene
 
@@ -38,7 +39,6 @@ _LOG = logging.getLogger(__name__)
 QUANTITIES: tuple[Quantity, ...] = ("color", *FEATURES)
 """What is rendered unless something else is asked for; colour is always there."""
 
-_POLL_S = 0.1
 _TRACE_SETTINGS = (
     "min_bounces",
     "max_bounces",
@@ -173,8 +173,7 @@ def _render_pass(mitsuba: Any, scene: Any, spp: int, seed: int, progress: Progre
         with ThreadPoolExecutor(max_workers=1) as executor:
             rendering = executor.submit(integrator.render, scene, scene.sensors()[0], seed, spp)
             try:
-                while not wait([rendering], timeout=_POLL_S).done:
-                    progress(float(parameters["progress"]), "")
+                wait_in_short_turns(rendering, lambda: progress(float(parameters["progress"]), ""))
             except BaseException:
                 integrator.cancel()
                 raise
