@@ -18,7 +18,6 @@ from tungsten_dip.fit import blend_network, training
 from tungsten_dip.fit.pilots import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto
-from tungsten_dip.onnx import inference
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
 from tungsten_dip.sequence.following import Follower, Models, _typical_error
@@ -516,8 +515,7 @@ def test_every_frame_is_denoised_on_the_device_of_the_settings(tmp_path, monkeyp
         return session_from_proto(proto, threads, device)
 
     devices = []
-    for module in (blend_network, inference):
-        monkeypatch.setattr(module, "session_from_proto", listed)
+    monkeypatch.setattr(blend_network, "session_from_proto", listed)
     settings = replace(DRAFT, device="cpu", seed=1)
     follower = Follower(settings, refit)
     for n in range(2):

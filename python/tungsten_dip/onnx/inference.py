@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from tungsten_dip.buffers.display import radiance_from_ldr
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, check_type, whole_number
 from tungsten_dip.fit import check_ready
-from tungsten_dip.fit.blend_network import BlendNetwork
-from tungsten_dip.fit.blending import blended_images, blends_all_samples, fit_blend
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import denoised_image, result_without_noise
-from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
-from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
+from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
 from tungsten_dip.fit.preparation import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
-from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.graphs.sessions import Device, session_from_proto
+from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import Progress, silent
-
-_BAND_PIXELS = 1 << 18
 
 
 def infer(
@@ -76,58 +69,6 @@ def inference_settings(model: Model, threads: int | None, refit_steps: int) -> F
             f"refit: expected 0 steps of a network of preset paper, got {refit_steps}; fit from it instead"
         )
     return settings
-
-
-def infer_blend(
-    model: Model,
-    buffers: RenderBuffers,
-    settings: FitSettings,
-    progress: Progress,
-    previous: Halves | None = None,
-) -> FitResult:
-    """Denoise sanitised buffers with a blend network, on the device of the settings; see `infer`.
-
-    ``previous`` is as in `tungsten_dip.fit.blending.fit_blend`.
-    """
-    clock = Clock()
-    assert model.layout is not None
-    unchanged = result_without_noise(buffers, settings, clock, progress)
-    if unchanged is not None:
-        return unchanged
-    halved = with_independent_halves(buffers, settings.seed, settings.threads)
-    evidence = evidence_from_buffers(halved, settings, model.layout, clock, progress, previous)
-    all_samples_pilots: tuple[FloatImage, ...] = ()
-    if blends_all_samples(settings, following=previous is not None):
-        all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
-    denoised, all_samples_blend = _blended(model, evidence, all_samples_pilots, settings.device)
-    result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)
-    progress(1.0, "inferred")
-    return replace(result, model=model)
-
-
-def _blended(
-    model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage], device: Device
-) -> tuple[Halves, FloatImage | None]:
-    """Return what `blended_images` does, band by band: the inputs of a large image need gigabytes."""
-    assert model.standardisation is not None
-    layout, threads = evidence.layout, evidence.threads
-    network = BlendNetwork(model.weights, len(layout.inputs), layout.candidate_count, device, threads)
-    height, width = evidence.mean.shape[:2]
-    rows = max(1, _BAND_PIXELS // width)
-    bands = []
-    for first in range(0, height, rows):
-        end = min(first + rows, height)
-        # The inputs of a row come from the rows around it.
-        above, below = max(first - INPUTS_RADIUS, 0), min(end + INPUTS_RADIUS, height)
-        inputs = network_inputs(evidence.rows(above, below))[
-            :, (first - above) * width : (end - above) * width
-        ]
-        model.standardisation.apply(inputs, threads)
-        pilots = [pilot[first:end] for pilot in all_samples_pilots]
-        bands.append(blended_images(network, inputs, evidence.rows(first, end), pilots))
-    halves, blends = zip(*bands, strict=True)
-    a, b = (np.concatenate(images) for images in zip(*halves, strict=True))
-    return (a, b), np.concatenate(blends) if all_samples_pilots else None
 
 
 def _infer_paper(
