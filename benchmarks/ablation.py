@@ -8,8 +8,8 @@ prints a Markdown table, one row per variant. Run it on a machine with nothing e
 import argparse
 import sys
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -17,7 +17,7 @@ from unittest import mock
 from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, blending, denoise, evidence, surfaces
+from tungsten_dip.fit import FitSettings, all_samples, blending, denoise, evidence, surfaces
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.report.metrics import compare
 
@@ -35,6 +35,15 @@ def _with_one_pilot() -> AbstractContextManager[object]:
     return mock.patch.dict(
         blending._PRESETS, balanced=replace(preset, pilots=(Pilot("guided", 10, step=2, k=1.0),))
     )
+
+
+@contextmanager
+def _with_occupied_space() -> Iterator[None]:
+    with (
+        mock.patch.object(evidence, "occupied_pixels", return_value=1),
+        mock.patch.object(all_samples, "occupied_pixels", return_value=1),
+    ):
+        yield
 
 
 VARIANTS: dict[str, Change] = {
@@ -56,7 +65,7 @@ VARIANTS: dict[str, Change] = {
         surfaces, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
     "no pilots of all samples": lambda: mock.patch.object(blending, "pilots_of_all_samples", return_value=()),
-    "empty space like any other": lambda: mock.patch.object(evidence, "_occupied", return_value=1),
+    "empty space like any other": _with_occupied_space,
 }
 
 

@@ -9,11 +9,12 @@ import pytest
 
 from conftest import MakeRender
 from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
-from tungsten_dip.fit import FitSettings, denoise, evidence, training
-from tungsten_dip.fit.evidence import Evidence, _baseline_errors, _caps, _denominators
+from tungsten_dip.fit import FitSettings, all_samples, denoise, evidence, training
+from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.exposure import unscaled
 from tungsten_dip.fit.inputs import loss_weights
 from tungsten_dip.fit.pilots import PilotMaker
+from tungsten_dip.fit.scoring import ErrorMeasure, _caps, _denominators
 
 
 def test_guides_are_as_noisy_as_is_said_of_them(
@@ -26,7 +27,8 @@ def test_guides_are_as_noisy_as_is_said_of_them(
         makers.append(PilotMaker(*arguments, **options))
         return makers[-1]
 
-    monkeypatch.setattr(evidence, "PilotMaker", recorded)
+    for module in (evidence, all_samples):
+        monkeypatch.setattr(module, "PilotMaker", recorded)
     for seed in range(4):
         denoise(make_render(20, 28, seed=seed).buffers, FitSettings("balanced", iterations=1, threads=1))
     for images in (2, 1):
@@ -72,9 +74,9 @@ def test_one_outlier_is_a_small_part_of_the_error_around_it() -> None:
     caps = _caps(candidates, (ones, ones), 1)
     np.testing.assert_allclose(caps[0], 20, rtol=1e-3)
     np.testing.assert_allclose(caps[1], 80, rtol=1e-3)
-    error = np.zeros((40, 40, 1), np.float32)
-    error[20, 20] = 1e6
-    errors, _ = _baseline_errors((error, error), caps, 1)
+    outlier = flat.copy()
+    outlier[20, 20] = 1e3
+    errors, _ = ErrorMeasure((ones, ones), caps).errors_around((outlier, outlier), (flat, flat), 1)
     assert errors[18, 22, 0] == pytest.approx(20 / (17**2 - 1), rel=1e-3)
 
 

@@ -20,9 +20,9 @@ from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffer
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, blending, denoise, training
+from tungsten_dip.fit.all_samples import pilots_of_all_samples
 from tungsten_dip.fit.blend_network import Examples
 from tungsten_dip.fit.blending import fit_blend
-from tungsten_dip.fit.evidence import pilots_of_all_samples
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots import (
     BALANCED_PILOTS,
@@ -293,10 +293,12 @@ def oidn_images(monkeypatch: pytest.MonkeyPatch) -> list[FloatImage]:
     """Images of both halves that another denoiser is to return, in the units of the render."""
     images: list[FloatImage] = []
     monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: object())
-    monkeypatch.setattr(
-        "tungsten_dip.fit.evidence.oidn_pilot",
-        lambda buffers, colors, scale, threads: tuple(image * np.float32(scale) for image in images),
-    )
+
+    def given(buffers: RenderBuffers, colors: Any, scale: float, threads: int) -> tuple[FloatImage, ...]:
+        return tuple(image * np.float32(scale) for image in images)
+
+    for module in ("evidence", "all_samples"):
+        monkeypatch.setattr(f"tungsten_dip.fit.{module}.oidn_pilot", given)
     return images
 
 

@@ -1,4 +1,4 @@
-"""Moves the result towards the blended pilots of all samples, with the weights found from the halves.
+"""The pilots of all samples; their blend, with the weights found from the halves, moves the result.
 
 Guides and features of all samples have half the noise variance, so that their pilots resolve more than the
 mean of two pilots of a half each. But no independent samples are left to score them, and they retain
@@ -7,15 +7,57 @@ outliers.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from threading import Event
+
 import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.evidence import PILOTS_SHARE, Evidence, occupied_pixels
+from tungsten_dip.fit.oidn import oidn_pilot
+from tungsten_dip.fit.pilots import PilotMaker, first_guides
+from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.surfaces import surfaces_of_halves
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
 """Relative difference of the halves' results from their mean at which all samples get weight 0.5."""
+
+
+def pilots_of_all_samples(
+    evidence: Evidence,
+    buffers: RenderBuffers,
+    settings: FitSettings,
+    clock: Clock,
+    given_up: Event | None = None,
+) -> tuple[FloatImage, ...]:
+    """Return the pilots of all samples, with less noisy features and guides than a half's.
+
+    One image for each of ``evidence.candidates``, in the units of the evidence, shape (height, width, 3).
+    None at all where the pilots of the halves have used up their share of the time budget, or once
+    ``given_up`` is set.
+    """
+    if clock.share_spent() > PILOTS_SHARE:
+        return ()
+    colors = (evidence.mean,)
+    surfaces = surfaces_of_halves(buffers, colors, evidence.scale, evidence.threads)
+    a, b = evidence.halves
+    variance = np.float32(0.25) * (a - b) ** 2
+    guides = first_guides(colors, surfaces, variance)
+    guides = replace(guides, variance=evidence.guide_variance / np.float32(2))
+    maker = PilotMaker(colors, surfaces, guides, variance)
+    occupied = occupied_pixels(evidence.halves, buffers, evidence.threads)
+    computed = []
+    for pilot in evidence.layout.pilots:
+        if given_up is not None and given_up.is_set():
+            return ()
+        computed.append(maker.images(pilot)[0] * occupied)
+    if settings.pilot == "oidn":
+        computed.extend(oidn_pilot(buffers, colors, evidence.scale, evidence.threads))
+    return (evidence.mean, *computed)
 
 
 def with_all_samples(denoised: Halves, all_samples_blend: FloatImage, threads: int) -> FloatImage:

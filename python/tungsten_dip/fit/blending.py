@@ -17,10 +17,11 @@ from typing import Self
 
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
+from tungsten_dip.fit.all_samples import pilots_of_all_samples
 from tungsten_dip.fit.blend_network import BlendNetwork
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
-from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
+from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model, source_sha256
 from tungsten_dip.fit.pilots import (

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers
+from tungsten_dip.fit.all_samples import pilots_of_all_samples
 from tungsten_dip.fit.blend_network import BlendNetwork
 from tungsten_dip.fit.blending import blended_images, blends_all_samples
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.denoised import denoised_image, result_without_noise
-from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers, pilots_of_all_samples
+from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.result import FitResult

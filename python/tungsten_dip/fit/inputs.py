@@ -15,7 +15,7 @@ import numpy as np
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
-from tungsten_dip.fit.evidence import Evidence, relative_error
+from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around, signed_mean_around
 
@@ -51,7 +51,7 @@ def loss_weights(evidence: Evidence) -> Halves:
     with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
         weight_a, weight_b = (
             np.reciprocal(d * (np.float32(_LEAST_NOISE) + error))
-            for d, error in zip(evidence.denominators, evidence.baseline_errors, strict=True)
+            for d, error in zip(evidence.measure.denominators, evidence.baseline_errors, strict=True)
         )
     return weight_a, weight_b
 
@@ -72,10 +72,8 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
     yield base[:, :, 0]
 
     other = evidence.halves[1 - half]
-    denominator = evidence.denominators[half]
     unit = np.float32(_SCORE_UNIT) * around + np.float32(_LEAST_ERROR)
-    cap = evidence.caps[half]
-    baseline_error = np.minimum(relative_error(baseline, other, denominator), cap)
+    baseline_error = evidence.measure.error(half, baseline, other)
     for index, candidate in enumerate(evidence.candidates):
         if index == layout.baseline_index:
             continue
@@ -84,7 +82,7 @@ def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
             # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
             image = mean_around(image, 1, threads)
         yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
-        worse = np.minimum(relative_error(candidate[half], other, denominator), cap) - baseline_error
+        worse = evidence.measure.error(half, candidate[half], other) - baseline_error
         for radius in SCORE_RADII:
             score = signed_mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]

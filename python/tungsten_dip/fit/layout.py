@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
+
+from tungsten_dip.errors import InputError
 
 SCORE_RADII = (2, 4, 8, 16)
 """Radii of the windows in which a candidate is scored, in pixels."""
@@ -60,6 +63,20 @@ class Layout:
     def candidate_count(self) -> int:
         """How many images the network blends."""
         return 1 + len(self.pilots) + self.extra_count
+
+    def check_fits(self, features: Collection[str], extra_count: int) -> None:
+        """Raise InputError that names the difference if an image has not these features and extra pilots."""
+        missing = [name for name in self.features if name not in features]
+        if missing:
+            raise InputError(
+                f"the model was fitted with {', '.join(missing)}, which this input does not have; render it, "
+                f"or fit without the model"
+            )
+        if self.extra_count != extra_count:
+            raise InputError(
+                f"the model was fitted with {self.extra_count} extra pilots (Open Image Denoise's image, the "
+                f"previous frame), this input comes with {extra_count}; fit without the model"
+            )
 
     @property
     def inputs(self) -> tuple[str, ...]:
