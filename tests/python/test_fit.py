@@ -330,8 +330,8 @@ def test_within_a_time_budget_the_pilots_of_draft_come_first(render: SyntheticRe
     result = denoise(render.buffers, _settings(preset="balanced", iterations=2, time_budget_s=1e6))
     check_result(result, render.buffers)
     assert result.model is not None
-    assert result.model.layout is not None
-    pilots = result.model.layout.pilots
+    assert result.model.blend is not None
+    pilots = result.model.blend.layout.pilots
     assert pilots[: len(DRAFT_PILOTS)] == DRAFT_PILOTS
     assert set(pilots) == {*DRAFT_PILOTS, *BALANCED_PILOTS}
 
@@ -340,8 +340,8 @@ def test_windows_as_large_as_the_image_are_left_out(make_render: MakeRender) -> 
     render = make_render(height=32, width=48)
     result = denoise(render.buffers, _settings(preset="final", iterations=2))
     assert result.model is not None
-    assert result.model.layout is not None
-    assert result.model.layout.pilots == BALANCED_PILOTS
+    assert result.model.blend is not None
+    assert result.model.blend.layout.pilots == BALANCED_PILOTS
 
 
 def test_the_target_error_ends_the_training(render: SyntheticRender) -> None:
@@ -773,7 +773,7 @@ def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):
     result = fit_blend(buffers, settings, silent, previous=(known, known))
     alone = denoise(buffers, settings)
     assert np.isfinite(result.color).all()
-    assert result.model.layout.extra_count == 1
+    assert result.model.blend.layout.extra_count == 1
 
     def error(image, rows):
         return float(np.mean((image[rows] - reference[rows]) ** 2))

@@ -91,8 +91,8 @@ def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
         settings = FitSettings(preset="draft", threads=1, pilot=pilot)
         result = denoise(render.buffers, settings)
         assert result.model is not None
-        assert result.model.layout is not None
-        assert result.model.layout.extra_count == (pilot == "oidn")
+        assert result.model.blend is not None
+        assert result.model.blend.layout.extra_count == (pilot == "oidn")
         return relmse(result.color, render.reference)
 
     assert error("oidn") < 1.1 * error("none")
@@ -106,5 +106,5 @@ def test_as_a_pilot_it_must_be_installed(render, without_pyoidn):
 def test_without_halves_it_is_a_pilot_too(render):
     buffers = render.buffers.with_quantities(color=Buffer(render.buffers.color.mean))
     result = denoise(buffers, FitSettings("draft", pilot="oidn", threads=1))
-    assert result.model.layout.extra_count == 1
+    assert result.model.blend.layout.extra_count == 1
     assert any("no half buffers" in note for note in result.notes)

@@ -13,7 +13,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings
 from tungsten_dip.fit.blend_network import first_weights
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import load_model, save_model
@@ -22,16 +22,19 @@ from tungsten_dip.onnx.file import proto_from_model
 
 def assert_same(first: Model, second: Model) -> None:
     for name, value in asdict(first).items():
-        if name in ("weights", "standardisation", "settings"):
+        if name in ("weights", "blend", "settings"):
             continue
         assert asdict(second)[name] == value
     assert first.weights.keys() == second.weights.keys()
     for name, weight in first.weights.items():
         np.testing.assert_array_equal(second.weights[name], weight)
-    if first.standardisation is not None:
-        assert second.standardisation is not None
-        np.testing.assert_array_equal(second.standardisation.mean, first.standardisation.mean)
-        np.testing.assert_array_equal(second.standardisation.std, first.standardisation.std)
+    assert second.is_paper == first.is_paper
+    if first.blend is not None:
+        assert second.blend is not None
+        assert second.blend.layout == first.blend.layout
+        before, after = first.blend.standardisation, second.blend.standardisation
+        np.testing.assert_array_equal(after.mean, before.mean)
+        np.testing.assert_array_equal(after.std, before.std)
 
 
 def test_round_trip(model: Model, saved: Path) -> None:
@@ -92,8 +95,7 @@ def test_every_model_survives_its_file(
         FitSettings("final", seed=seed),
         relmse,
         "0" * 64,
-        layout,
-        constants,
+        Blend(layout, constants),
     )
     again = model_file._model_from_bytes(proto_from_model(fit).SerializeToString())
     assert_same(fit, again)

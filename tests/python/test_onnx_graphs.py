@@ -20,7 +20,7 @@ from tungsten_dip.fit.blend_network import Examples, first_weights
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import infer
 from tungsten_dip.onnx.file import proto_from_model
@@ -80,18 +80,19 @@ def test_inference_repeats_the_fit(fitted: FitResult, model: Model, frame: Synth
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_blend_agrees_with_torch_at_sizes_never_exported(size: tuple[int, int], model: Model) -> None:
-    assert model.layout is not None
-    assert model.standardisation is not None
+    assert model.blend is not None
     rng = np.random.default_rng(0)
     height, width = size
     inputs = rng.normal(0, 2, (2, len(model.inputs), height, width)).astype(np.float32)
-    candidates = rng.random((2, model.layout.candidate_count, 3, height, width), np.float32)
+    candidates = rng.random((2, model.blend.layout.candidate_count, 3, height, width), np.float32)
     color = session_of(model).run(None, {"inputs": inputs, "candidates": candidates})[0]
     assert color.shape == (2, 3, height, width)
 
     flat = inputs.reshape(2, len(model.inputs), -1).transpose(0, 2, 1).copy()
-    model.standardisation.apply(flat, threads=1)
-    flat_candidates = candidates.reshape(2, model.layout.candidate_count, 3, -1).transpose(0, 3, 1, 2).copy()
+    model.blend.standardisation.apply(flat, threads=1)
+    flat_candidates = (
+        candidates.reshape(2, model.blend.layout.candidate_count, 3, -1).transpose(0, 3, 1, 2).copy()
+    )
     network = TorchNetwork(model.weights)
     for half in (0, 1):
         examples = Examples(flat[half], flat_candidates[half], flat_candidates[half, :, 0], flat[half, :, :1])
@@ -162,7 +163,7 @@ def test_an_input_that_varies_little_around_a_large_mean_keeps_its_digits() -> N
     standardisation = Standardisation(mean, np.full(inputs, 0.02, np.float32))
     weights = first_weights(layout, 0, 1)
     weights["layer3.weight"] = rng.normal(size=weights["layer3.weight"].shape).astype(np.float32)
-    fit = Model(layout.inputs, weights, FitSettings(), None, "", layout, standardisation)
+    fit = Model(layout.inputs, weights, FitSettings(), None, "", Blend(layout, standardisation))
     candidates = rng.random((2, 2, 3, 6, 7), np.float32)
     color = session_of(fit).run(None, {"inputs": raw, "candidates": candidates})[0]
     standardisation.apply(flat, threads=1)

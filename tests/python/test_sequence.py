@@ -423,8 +423,8 @@ def test_followed_frames_have_few_pilots_of_their_own(tmp_path, preset, pilots):
     follower = Follower(FitSettings(preset, seed=1))
     frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
     followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
-    assert follower.models.following.layout.pilots == pilots
-    assert follower.models.following.layout.extra_count == 1
+    assert follower.models.following.blend.layout.pilots == pilots
+    assert follower.models.following.blend.layout.extra_count == 1
     assert relmse(followed[1].result.color, frames[1].reference) < 0.3 * relmse(
         frames[1].buffers.color.mean, frames[1].reference
     )
@@ -631,7 +631,7 @@ def test_frames_that_gain_features_use_them(tmp_path, with_cameras):
         buffers = frame.buffers if n >= 2 else frame.buffers.with_quantities(albedo=None, normal=None)
         followed = follower.denoise(buffers, frame.camera if with_cameras else None)
         how.append(followed.how)
-        assert ("normal.X" in followed.result.model.layout.features) == (n >= 2)
+        assert ("normal.X" in followed.result.model.blend.layout.features) == (n >= 2)
     assert how == ["fitted", "followed", "cut", "followed"]
 
 

@@ -39,10 +39,10 @@ def test_a_warm_start_starts_from_the_weights_and_constants(
 
     other = denoise(next_frame.buffers, replace(DRAFT, iterations=1), warm_start=model)
     assert other.model is not None
-    assert model.standardisation is not None
-    assert other.model.standardisation is not None
-    np.testing.assert_array_equal(other.model.standardisation.mean, model.standardisation.mean)
-    assert other.model.layout == model.layout
+    assert model.blend is not None
+    assert other.model.blend is not None
+    np.testing.assert_array_equal(other.model.blend.standardisation.mean, model.blend.standardisation.mean)
+    assert other.model.blend.layout == model.blend.layout
     assert other.model.source_sha256 != model.source_sha256
 
 
@@ -109,9 +109,9 @@ def test_a_network_is_fitted_anew_to_an_image_unlike_the_models(
     # A refit limits how long a network is trained further; a new one of preset draft takes 80 steps.
     assert result.iterations == {"denoise": 20, "infer": 80}[by]
     assert result.model is not None
-    assert result.model.standardisation is not None
-    assert model.standardisation is not None
-    assert not np.array_equal(result.model.standardisation.mean, model.standardisation.mean)
+    assert result.model.blend is not None
+    assert model.blend is not None
+    assert not np.array_equal(result.model.blend.standardisation.mean, model.blend.standardisation.mean)
     # What is written is a model that can be used.
     assert np.isfinite(infer(result.model, unlike, threads=1).color).all()
 
@@ -183,7 +183,7 @@ def test_the_commands_of_the_base_installation_do_without_torch(
     )
     assert "5 iterations" in told
     assert out.exists()
-    assert load_model(refined).layout == load_model(saved).layout
+    assert load_model(refined).blend.layout == load_model(saved).blend.layout
     run("infer", refined, tmp_path / "in", "-o", tmp_path / "again.exr", "--error-map", tmp_path / "e.exr")
     assert "psnr" in run("compare", out, tmp_path / "again.exr").lower()
 

@@ -99,8 +99,8 @@ def fit_blend(
     halved = with_independent_halves(buffers, settings.seed, settings.threads)
     following = previous is not None
     preset = _preset(settings, following)
-    layout = None if warm_start is None else warm_start.layout
-    plan = layout or _pilots(buffers, settings, preset, following)
+    blend = None if warm_start is None else warm_start.blend
+    plan = _pilots(buffers, settings, preset, following) if blend is None else blend.layout
     evidence = evidence_from_buffers(halved, settings, plan, clock, progress, previous)
     start = start_of_training(evidence, settings.seed, warm_start, preset.members)
     if start.warm and refit_steps is not None:
@@ -154,8 +154,7 @@ def fit_blend(
             settings=settings,
             estimated_relmse=result.estimated_relmse,
             source_sha256=source_sha256(buffers),
-            layout=evidence.layout,
-            standardisation=start.standardisation,
+            blend=start.blend,
         ),
         history=tuple(training.history),
         interrupted=training.interrupted,

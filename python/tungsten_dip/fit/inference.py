@@ -19,7 +19,7 @@ from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.graphs.sessions import Device
+from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.progress import Progress
 
 _BAND_PIXELS = 1 << 18
@@ -33,33 +33,37 @@ def infer_blend(
     progress: Progress,
     previous: Halves | None = None,
 ) -> FitResult:
-    """Denoise sanitised buffers with a blend network, on the device of the settings; see `infer`.
+    """Denoise sanitised buffers with the network of ``model``, which blends, on the device of the settings.
 
     ``previous`` is as in `tungsten_dip.fit.blending.fit_blend`.
     """
     clock = Clock()
-    assert model.layout is not None
+    assert model.blend is not None
     unchanged = result_without_noise(buffers, settings, clock, progress)
     if unchanged is not None:
         return unchanged
     halved = with_independent_halves(buffers, settings.seed, settings.threads)
-    evidence = evidence_from_buffers(halved, settings, model.layout, clock, progress, previous)
+    evidence = evidence_from_buffers(halved, settings, model.blend.layout, clock, progress, previous)
     all_samples_pilots: tuple[FloatImage, ...] = ()
     if blends_all_samples(settings, following=previous is not None):
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, settings, clock)
-    denoised, all_samples_blend = _blended(model, evidence, all_samples_pilots, settings.device)
+    layout = evidence.layout
+    network = BlendNetwork(
+        model.weights, len(layout.inputs), layout.candidate_count, settings.device, evidence.threads
+    )
+    denoised, all_samples_blend = _blended(network, model.blend.standardisation, evidence, all_samples_pilots)
     result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)
     progress(1.0, "inferred")
     return replace(result, model=model)
 
 
 def _blended(
-    model: Model, evidence: Evidence, all_samples_pilots: Sequence[FloatImage], device: Device
+    network: BlendNetwork,
+    standardisation: Standardisation,
+    evidence: Evidence,
+    all_samples_pilots: Sequence[FloatImage],
 ) -> tuple[Halves, FloatImage | None]:
     """Return what `blended_images` does, band by band: the inputs of a large image need gigabytes."""
-    assert model.standardisation is not None
-    layout, threads = evidence.layout, evidence.threads
-    network = BlendNetwork(model.weights, len(layout.inputs), layout.candidate_count, device, threads)
     height, width = evidence.mean.shape[:2]
     rows = max(1, _BAND_PIXELS // width)
     bands = []
@@ -70,7 +74,7 @@ def _blended(
         inputs = network_inputs(evidence.rows(above, below))[
             :, (first - above) * width : (end - above) * width
         ]
-        model.standardisation.apply(inputs, threads)
+        standardisation.apply(inputs, evidence.threads)
         pilots = [pilot[first:end] for pilot in all_samples_pilots]
         bands.append(blended_images(network, inputs, evidence.rows(first, end), pilots))
     halves, blends = zip(*bands, strict=True)

@@ -21,12 +21,22 @@ Weights = dict[str, npt.NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
+class Blend:
+    """What a network of the presets draft, balanced and final blends, and how its inputs are standardised.
+
+    The constants of ``standardisation`` are those of the image that it was fitted to.
+    """
+
+    layout: Layout
+    standardisation: Standardisation
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """A fitted network and all that is needed to use it on another image.
 
-    That of the presets draft, balanced and final blends, pixel by pixel, the candidates of ``layout``, and
-    its inputs are standardised with constants of the image that it was fitted to. The networks of the preset
-    paper give the image themselves; for them ``layout`` and ``standardisation`` are None.
+    That of the presets draft, balanced and final blends candidates pixel by pixel. The networks of the preset
+    paper give the image themselves; for them ``blend`` is None.
 
     ``inputs`` names the network's inputs in order. Of the fit's ``settings``, only those that determine a
     network are kept; the others have their defaults, as in a model that was loaded. ``estimated_relmse`` is
@@ -39,8 +49,7 @@ class Model:
     settings: FitSettings
     estimated_relmse: float | None
     source_sha256: str
-    layout: Layout | None = None
-    standardisation: Standardisation | None = None
+    blend: Blend | None = None
     version: str = metadata.version("tungsten-dip")
 
     def __post_init__(self) -> None:
@@ -50,7 +59,12 @@ class Model:
     @property
     def kind(self) -> Literal["blend", "skip", "resnet"]:
         """What network it is."""
-        return self.settings.network if self.settings.preset == "paper" else "blend"
+        return self.settings.network if self.is_paper else "blend"
+
+    @property
+    def is_paper(self) -> bool:
+        """Whether it is a network of the preset paper, which gives the image itself."""
+        return self.blend is None
 
 
 def source_sha256(buffers: RenderBuffers) -> str:

@@ -18,10 +18,10 @@ from tungsten_dip.fit.inputs import (
     loss_weights,
     network_inputs,
 )
-from tungsten_dip.fit.model import Model, Weights
+from tungsten_dip.fit.model import Blend, Model, Weights
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.standardisation import LARGEST_INPUT, Standardisation, standardisation_of
+from tungsten_dip.fit.standardisation import LARGEST_INPUT, standardisation_of
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2
@@ -62,7 +62,7 @@ class Start:
 
     evidence: Evidence
     examples: Examples
-    standardisation: Standardisation
+    blend: Blend
     weights: Weights
     warm: bool
     notes: tuple[str, ...] = ()
@@ -75,24 +75,25 @@ def start_of_training(evidence: Evidence, seed: int, model: Model | None, member
     """
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()
-    if model is not None and model.standardisation is not None:
-        model.standardisation.apply(inputs, evidence.threads)
+    if model is not None and model.blend is not None:
+        model.blend.standardisation.apply(inputs, evidence.threads)
         far_out = [float((np.abs(image) >= LARGEST_INPUT).mean()) for image in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
-            return _start(evidence, inputs, model.standardisation, model.weights, warm=True)
+            return _start(evidence, inputs, model.blend, model.weights, warm=True)
         notes = ("the image is too unlike the model's: a new network is fitted",)
         evidence = with_best_baseline(evidence)
         inputs = network_inputs(evidence)
     standardisation = standardisation_of(inputs, evidence.threads)
     standardisation.apply(inputs, evidence.threads)
     weights = first_weights(evidence.layout, seed, members)
-    return _start(evidence, inputs, standardisation, weights, warm=False, notes=notes)
+    blend = Blend(evidence.layout, standardisation)
+    return _start(evidence, inputs, blend, weights, warm=False, notes=notes)
 
 
 def _start(
     evidence: Evidence,
     inputs: FloatArray,
-    standardisation: Standardisation,
+    blend: Blend,
     weights: Weights,
     warm: bool,
     notes: tuple[str, ...] = (),
@@ -113,7 +114,7 @@ def _start(
     views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in candidates.transpose(2, 0, 1, 3))
     examples = Examples(inputs.reshape(2 * pixels, -1), candidates.reshape(2 * pixels, -1, 3), target, weight)
     evidence = replace(evidence, candidates=views, features=({}, {}))
-    return Start(evidence, examples, standardisation, weights, warm, notes)
+    return Start(evidence, examples, blend, weights, warm, notes)
 
 
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:

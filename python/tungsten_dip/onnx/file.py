@@ -25,7 +25,7 @@ from onnx import TensorProto, numpy_helper
 from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.settings import NETWORK_SETTINGS, FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx.graph import graph_of
@@ -99,12 +99,13 @@ def proto_from_model(model: Model) -> onnx.ModelProto:
         "estimated_relmse": model.estimated_relmse,
         "source_sha256": model.source_sha256,
     }
-    if model.layout is not None:
+    if model.blend is not None:
+        layout = model.blend.layout
         facts["layout"] = {
-            "features": model.layout.features,
-            "pilots": [asdict(pilot) for pilot in model.layout.pilots],
-            "extra_pilots": model.layout.extra_count,
-            "baseline": model.layout.baseline_index,
+            "features": layout.features,
+            "pilots": [asdict(pilot) for pilot in layout.pilots],
+            "extra_pilots": layout.extra_count,
+            "baseline": layout.baseline_index,
         }
     return graph_of(model, {_PROPERTY: json.dumps(facts, sort_keys=True)})
 
@@ -208,7 +209,7 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
     relmse = _checked("estimated_relmse", facts.get("estimated_relmse"), float | None)
     inputs = _checked("inputs", facts.get("inputs"), tuple[str, ...])
     version, source = (_checked(name, facts.get(name), str) for name in ("version", "source_sha256"))
-    layout = standardisation = None
+    blend = None
     if settings.preset != "paper":
         layout = _layout(_object("layout", facts.get("layout")))
         if layout.inputs != inputs:
@@ -216,14 +217,14 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
         mean, std = (_array(tensors.pop(n, None), n, dtype) for n, dtype in (("mean", "f8"), ("std", "f4")))
         if not (std > 0).all():
             raise InputError("std: expected numbers above 0")
-        standardisation = Standardisation(mean.ravel(), std.ravel())
+        blend = Blend(layout, Standardisation(mean.ravel(), std.ravel()))
     # Other initializers are constants of the graph, which the comparison of the graphs checks.
     weights = {
         name: _array(tensor, name, "f4")
         for name, tensor in tensors.items()
         if name.endswith((".weight", ".bias"))
     }
-    return Model(inputs, weights, settings, relmse, source, layout, standardisation, version)
+    return Model(inputs, weights, settings, relmse, source, blend, version)
 
 
 def _layout(facts: dict[str, Any]) -> Layout:

@@ -45,12 +45,13 @@ def graph_of(model: Model, metadata: dict[str, str] | None = None) -> onnx.Model
     inputs = len(model.inputs)
     shapes: dict[str, tuple[int | str, ...]] = {"inputs": ("N", inputs, "H", "W")}
     outputs = 3
-    if model.layout is not None and model.standardisation is not None:
-        shapes["candidates"] = ("N", model.layout.candidate_count, 3, "H", "W")
-        mean, std = model.standardisation.mean, model.standardisation.std
+    if model.blend is not None:
+        candidates = model.blend.layout.candidate_count
+        shapes["candidates"] = ("N", candidates, 3, "H", "W")
+        mean, std = model.blend.standardisation.mean, model.blend.standardisation.std
         if not mean.shape == std.shape == (inputs,):
             raise InputError(f"the model has constants for {mean.size} inputs, and {inputs} inputs")
-        build.blend(inputs, model.layout.candidate_count, mean, std)
+        build.blend(inputs, candidates, mean, std)
     else:
         name = "head.bias" if model.kind == "skip" else "last.bias"
         outputs = model.weights[name].size if name in model.weights else 3

@@ -46,7 +46,7 @@ def infer(
     check_type("model", model, Model, "load_model reads one from a file")
     settings = inference_settings(model, threads, refit_steps)
     prepared = prepare_input(buffers, threads)
-    if model.layout is None:
+    if model.is_paper:
         result = _infer_paper(model, prepared.buffers, settings, progress)
     elif refit_steps:
         result = fit_blend(prepared.buffers, settings, progress, model, refit_steps=refit_steps)
@@ -62,7 +62,7 @@ def inference_settings(model: Model, threads: int | None, refit_steps: int) -> F
     """
     whole_number("refit_steps", refit_steps, 0, MOST_ITERATIONS)
     settings = replace(model.settings, threads=threads, iterations=None)
-    if model.layout is not None:
+    if not model.is_paper:
         check_ready(settings)
     elif refit_steps:
         raise InputError(

@@ -213,8 +213,8 @@ def _features(buffers: RenderBuffers) -> list[str]:
 
 
 def _is_new(network: Model | None, model: Model | None) -> bool:
-    """Whether a result has a network of its own: ``model`` keeps its constants when it is trained further."""
-    return network is not None and (model is None or network.standardisation is not model.standardisation)
+    """Whether a result has a network of its own: ``model`` keeps its `Blend` when it is trained further."""
+    return network is not None and (model is None or network.blend is not model.blend)
 
 
 def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int | None) -> Halves | None:
