@@ -833,9 +833,21 @@ def test_no_light_where_nothing_is_covered(
     planes = {name: np.where(light, plane, np.float32(0)) for name, plane in color.planes()}
     buffers = RenderBuffers(Buffer(**planes), alpha=alpha)
     settings = _settings() if preset == "draft" else FitSettings("paper", iterations=2, inputs="random")
-    result = denoise(buffers, settings).color
-    assert (result[~(covered | glow)] == 0).all()
-    assert (result[glow] > 0).all()
+    result = denoise(buffers, settings)
+    for image in (result.color, *(result.halves or ())):
+        assert (image[~(covered | glow)] == 0).all()
+        assert (image[glow] > 0).all()
+
+
+def test_halves_of_an_image_without_noise_are_copies(render: SyntheticRender) -> None:
+    truth = render.reference
+    half_a, half_b = truth, truth * np.float32(1.001)
+    result = denoise(RenderBuffers(Buffer((half_a + half_b) / 2, half_a, half_b)), _settings())
+    assert result.model is None
+    assert result.halves is not None
+    for half, given in zip(result.halves, (half_a, half_b), strict=True):
+        np.testing.assert_array_equal(half, given)
+        assert not np.shares_memory(half, given)
 
 
 def test_a_colour_without_a_sane_pixel_is_told(

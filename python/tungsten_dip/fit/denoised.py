@@ -53,7 +53,7 @@ def result_without_noise(
         iterations=0,
         error=_core.box_mean(error, _ERROR_RADIUS, thread_count(settings.threads)),
         estimated_relmse=float(error.mean(dtype=np.float64)),
-        halves=(a, b),
+        halves=(a.copy(), b.copy()),
         notes=(f"{why}: the image is returned as it is",),
     )
 

@@ -124,8 +124,8 @@ def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
 def finish_result(result: FitResult, prepared: Prepared) -> FitResult:
     """Return the result with the notes on its input before its own, all of which are logged.
 
-    Where alpha and colour of the input are 0 the result is black: radiance without coverage would glow around
-    the image that it is composited over.
+    Where alpha and colour of the input are 0 the result and its halves are black: radiance without coverage
+    would glow around the image that it is composited over.
     """
     result = replace(result, notes=(*prepared.notes, *result.notes))
     for note in result.notes:
@@ -134,4 +134,11 @@ def finish_result(result: FitResult, prepared: Prepared) -> FitResult:
     if alpha is None:
         return result
     empty = (alpha <= 0) & (prepared.buffers.color.mean == 0).all(axis=2, keepdims=True)
-    return replace(result, color=np.where(empty, np.float32(0), result.color))
+
+    def blackened(image: FloatImage) -> FloatImage:
+        return np.where(empty, np.float32(0), image)
+
+    halves = result.halves
+    if halves is not None:
+        halves = blackened(halves[0]), blackened(halves[1])
+    return replace(result, color=blackened(result.color), halves=halves)

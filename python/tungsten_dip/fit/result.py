@@ -23,14 +23,13 @@ class FitResult:
     """A denoised image, its estimated error, and the fitted network.
 
     ``color`` is linear radiance, float32, shape (height, width, 3). ``halves`` are the results of half A of
-    the samples alone and of half B alone, in the units and shape of ``color``, which is their mean with the
-    preset draft, and with the others moved from it towards the pilots of all samples. ``estimated_relmse`` is
-    the estimated relMSE (with epsilon 0.01) of the mean of ``halves``, before that move, and ``error`` its
-    estimated relative squared error around every pixel, shape (height, width, 1), the mean over 9x9 pixels.
-    These three are None with the preset paper.
-    ``gain``, shape (height, width, 1), is what ``color`` was multiplied by at last to give back some of the
-    radiance of fireflies (`fit.fireflies`); None without fireflies. The errors do not include what is lost of
-    it.
+    the samples alone and of half B alone, in the same units and shape. ``color`` is their mean, with the
+    presets balanced and final moved towards the pilots of all samples, and then multiplied by the ``gain``.
+    ``estimated_relmse`` is the estimated relMSE (with epsilon 0.01) of the mean of ``halves``, and ``error``
+    its estimated relative squared error around every pixel, shape (height, width, 1), the mean over 9x9
+    pixels. ``halves`` and both errors are None with the preset paper.
+    ``gain``, shape (height, width, 1), gives back some of the radiance of fireflies (`fit.fireflies`); None
+    without fireflies. The errors do not include what is lost of it.
     ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it
     (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
     ``interrupted`` indicates that Ctrl-C ended the fit early. ``notes`` are one line each, for example on
