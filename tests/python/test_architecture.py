@@ -37,6 +37,13 @@ def test_the_table_lists_every_folder() -> None:
     assert {*folders, "root"} == set(layers())
 
 
+def test_the_table_of_a_fit_lists_every_module() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    table = page.partition("| module of `fit/` |")[2].partition("\n\n")[0]
+    modules = {path.stem for path in (PACKAGE / "fit").glob("*.py")} - {"__init__"}
+    assert modules <= set(re.findall(r"`(\w+)`", table))
+
+
 def test_imports_point_downwards_only() -> None:
     order = layers()
     checked, upwards = 0, []
