@@ -19,10 +19,10 @@ def remarks_from_log() -> Iterator[list[str]]:
 
 @contextmanager
 def logging_to(handler: logging.Handler) -> Iterator[None]:
-    """Hand what the library logs at INFO and above to the handler, within the block alone."""
+    """Hand what the library logs at the handler's level and above to it, within the block alone."""
     logger = logging.getLogger("tungsten_dip")
     level = logger.level
-    logger.setLevel(logging.INFO)
+    logger.setLevel(min(handler.level, logger.getEffectiveLevel()))
     logger.addHandler(handler)
     try:
         yield

@@ -22,6 +22,7 @@ from tungsten_dip.buffers.image_file import read_parts, write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers, read_image
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli.tungsten_dip import main
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import source_sha256
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.onnx import load_model, save_model
@@ -201,6 +202,49 @@ def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     assert "3 of 5 frames without a result: 1-2, 4; the others are done" in error
     assert "Traceback" not in error
     assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+@pytest.mark.parametrize("error", [RuntimeError("a bug\nin two lines"), MemoryError()])
+def test_a_frame_that_fails_for_whatever_reason_is_told_and_the_others_done(
+    frames, capsys, monkeypatch, error, on_cluster
+):
+    real = work.read_buffers
+
+    def broken(path, mapping):
+        if path.name == "f0000":
+            raise error
+        return real(path, mapping)
+
+    monkeypatch.setattr(work, "read_buffers", broken)
+    if on_cluster:
+        distributed = pytest.importorskip("distributed")
+        with distributed.LocalCluster(
+            n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
+        ) as local:
+            assert main(arguments("--scheduler", local.scheduler_address)) == 2
+    else:
+        assert main(arguments()) == 2
+    lines = capsys.readouterr().err.splitlines()
+    told = "RuntimeError: a bug in two lines" if str(error) else "MemoryError"
+    assert f"tungsten-dip: frame 0: {told}" in lines
+    assert lines[-1].endswith("1 of 4 frames without a result: 0; the others are done")
+    assert len(outputs(frames)) == COUNT - 1
+
+
+def test_the_traceback_of_a_frame_that_failed_is_told_on_demand(frames, capsys, monkeypatch):
+    def broken(path, mapping):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(work, "read_buffers", broken)
+    assert main(arguments("--frames", "0")) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    monkeypatch.setenv("TUNGSTEN_DIP_DEBUG", "1")
+    with pytest.raises(InputError, match="1 of 1 frames without a result"):
+        main(arguments("--frames", "0"))
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert "in broken" in err
 
 
 @pytest.mark.parametrize("more", [(), ("--workers", "2")])
@@ -518,21 +562,40 @@ def test_the_first_two_frames_fit_the_networks_of_all_others(frames, capfd):
     assert iterations[2:] == [0, 0]
 
 
-def test_frames_of_a_task_that_fails_halfway_are_kept(frames, capsys, monkeypatch):
+@pytest.mark.parametrize("cameras", [True, False])
+@pytest.mark.parametrize("killer", [0, 1, 2])
+def test_a_frame_that_no_worker_survives_is_told_and_the_others_done(
+    frames, capfd, monkeypatch, killer, cameras
+):
     distributed = pytest.importorskip("distributed")
     from tungsten_dip.sequence import cluster as module
 
-    def first_alone(frames, run, models):
-        work.denoise_frames(frames[:1], run, models)
-        raise RuntimeError("out of memory")
+    def dying_at_one(frames, run, models):
+        before = [frame for frame in frames if frame.number < killer]
+        done = work.denoise_frames(before, run, models)
+        if killer in (frame.number for frame in frames):
+            raise RuntimeError("it died")
+        rest = frames[len(before) :]
+        return work.denoise_frames(rest, run, models) if rest else done
 
-    monkeypatch.setattr(module, "denoise_frames", first_alone)
+    monkeypatch.setattr(module, "denoise_frames", dying_at_one)
+    command = arguments("--json", "--refit", "0")
+    if not cameras:
+        command = [word for word in command if "camera" not in word]
     with distributed.LocalCluster(
         n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
     ) as local:
-        assert main(arguments("--scheduler", local.scheduler_address)) == 2
-    assert "3 of 4 frames without a result: 1-3; the others are done" in capsys.readouterr().err
-    assert list(outputs(frames)) == ["f0000.exr"]
+        assert main([*command, "--scheduler", local.scheduler_address]) == 2
+    out, err = capfd.readouterr()
+    assert f"frame {killer}: RuntimeError: it died" in err
+    assert f"1 of 4 frames without a result: {killer}; the others are done" in err
+    done = [record["iterations"] for record in json.loads(out)["frames"] if record["error"] is None]
+    assert len(done) == len(outputs(frames)) == COUNT - 1
+    # They share the network of the first of them, with cameras that of the second as well.
+    fits = 2 if cameras else 1
+    assert min(done[:fits]) > 0
+    if killer != 1 or not cameras:
+        assert done[fits:] == [0] * (COUNT - 1 - fits)
 
 
 def test_a_saved_model_is_that_of_the_first_frame_and_stays(frames, capsys):

@@ -69,7 +69,7 @@ def run(command: str, body: Callable[[], None]) -> int:
     debug = bool(os.environ.get(DEBUG_VARIABLE))
     _replace_closed_streams()
     try:
-        with _log_on_stderr(command):
+        with _log_on_stderr(command, logging.DEBUG if debug else logging.INFO):
             body()
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -228,8 +228,8 @@ class _StderrHandler(logging.Handler):
 
 
 @contextmanager
-def _log_on_stderr(command: str) -> Iterator[None]:
-    handler = _StderrHandler()
+def _log_on_stderr(command: str, level: int) -> Iterator[None]:
+    handler = _StderrHandler(level)
     handler.setFormatter(logging.Formatter(f"{command}: %(message)s"))
     with logging_to(handler):
         yield

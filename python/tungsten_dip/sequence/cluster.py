@@ -2,7 +2,7 @@
 
 The first frame's networks are shared by all that begin later. Frames that follow one another are one task, so
 that what one shows helps the next. A worker that dies loses the frame in hand: its task is done again
-elsewhere and skips what is finished.
+elsewhere and skips what is finished. A frame that no worker survives is given up, and the others are done.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from multiprocessing import resource_tracker
-from operator import itemgetter
 from typing import Any
 
 from tungsten_dip.cores import thread_count
@@ -106,34 +105,61 @@ def _done(
     from distributed import as_completed
 
     count = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    if frames[0].scene is not None:
-        # The second frame fits the network for those that follow; all others follow one another.
-        leads = [frames[:_LEADS]]
-        length = max(1, min(_LONGEST_TASK, -(-(len(frames) - _LEADS) // count)))
-    else:
-        # No frame helps another but by its network: rather than wait for one, every worker fits one.
-        leads = [[frame] for frame in frames[:count]]
-        length = 1
     group = f"frames-{os.urandom(4).hex()}"
-    tasks = {client.submit(_denoise_frames, lead, run, models, pure=False): lead for lead in leads}
-    first = next(iter(tasks))
-    shared = client.submit(itemgetter(1), first, pure=False)
-    rest = frames[sum(map(len, leads)) :]
-    for start in range(0, len(rest), length):
-        part = rest[start : start + length]
+    tasks: dict[Any, list[Frame]] = {}
+    running = as_completed()
+
+    def submit(part: list[Frame]) -> Any:
         # Tasks whose keys say that they are alike wait at the scheduler until a worker is free.
-        tasks[
-            client.submit(_denoise_frames, part, run, shared, key=(group, start), pure=False, priority=-start)
-        ] = part
-    for task in as_completed(tasks):
-        if task.status == "finished":
-            records, found, remarks = task.result()
-            yield records, found if task is first else None, remarks
-        else:
-            error = task.exception() if task.status == "error" else InputError(_LOST)
-            # Frames that it had finished by then are there.
-            to_do, records = split_finished(tasks[task], run)
-            yield [*records, *(failed(frame, error) for frame in to_do)], None, []
+        number = len(tasks)
+        task = client.submit(
+            _denoise_frames, part, run, models, key=(group, number), pure=False, priority=-number
+        )
+        tasks[task] = part
+        running.add(task)
+        return task
+
+    follow = frames[0].scene is not None
+    # Where frames follow, the second one fits the network for those that follow.
+    leads = _LEADS if follow else 1
+    first, waiting = submit(frames[:leads]), frames[leads:]
+    if not follow:
+        # No frame helps another but by its network: rather than wait for one, every worker fits one.
+        for frame in waiting[: count - 1]:
+            submit([frame])
+        waiting = waiting[count - 1 :]
+    for task in running:
+        records, networks, remarks, left = _outcome(task, tasks[task], run)
+        yield records, networks if task is first else None, remarks
+        if task is not first:
+            if left:
+                submit(left)
+        elif networks is not None:
+            models = networks
+            length = max(1, min(_LONGEST_TASK, -(-len(waiting) // count))) if follow else 1
+            for start in range(0, len(waiting), length):
+                submit(waiting[start : start + length])
+            waiting = []
+        elif task.status == "error" and left + waiting:
+            # The next frames lead in its place.
+            waiting = left + waiting
+            first, waiting = submit(waiting[:leads]), waiting[leads:]
+    yield [failed(frame, InputError(_LOST)) for frame in waiting], None, []
+
+
+def _outcome(
+    task: Any, frames: list[Frame], run: Run
+) -> tuple[list[Record], Models | None, list[str], list[Frame]]:
+    """Return what `_denoise_frames` does and the frames that are still to be done.
+
+    A task fails where its worker dies time and again: at the first of the frames that are not finished.
+    """
+    if task.status == "finished":
+        return *task.result(), []
+    to_do, records = split_finished(frames, run)
+    if task.status != "error":
+        return [*records, *(failed(frame, InputError(_LOST)) for frame in to_do)], None, [], []
+    return [*records, *(failed(frame, task.exception()) for frame in to_do[:1])], None, [], to_do[1:]
 
 
 def _denoise_frames(frames: list[Frame], run: Run, models: Models) -> tuple[list[Record], Models, list[str]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
@@ -24,6 +25,8 @@ from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
 from tungsten_dip.sequence.frames import Frame
+
+_LOG = logging.getLogger(__name__)
 
 _RECORD = OWN + "frame"
 """The attribute of a frame's file that holds its record."""
@@ -94,7 +97,7 @@ def split_finished(frames: Iterable[Frame], run: Run) -> tuple[list[Frame], list
     for frame in frames:
         try:
             record = finished(frame, run)
-        except InputError as error:
+        except Exception as error:
             record = failed(frame, error)
         if record is None:
             to_do.append(frame)
@@ -112,8 +115,9 @@ def denoise_frames(
 ) -> tuple[list[Record], Models]:
     """Denoise frames one after another; return their records and the networks in the end.
 
-    Frames that are finished are skipped; one that cannot be read or written has an error in its record, and
-    the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short is not saved.
+    Frames that are finished are skipped; one that cannot be done, for whatever reason, has an error in its
+    record, and the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short
+    is not saved.
     ``on_record`` gets every record as soon as it is known.
     """
     follower = Follower(run.settings, run.refit, models)
@@ -125,7 +129,7 @@ def denoise_frames(
         is_consecutive = bool(records) and records[-1].error is None and not records[-1].skipped
         try:
             record = finished(frame, run) or _denoise(frame, run, follower, is_consecutive, part)
-        except (InputError, OSError) as error:
+        except Exception as error:
             record = failed(frame, error)
         records.append(record)
         on_record(record)
@@ -158,9 +162,16 @@ def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, p
     return record
 
 
-def failed(frame: Frame, error: Exception) -> Record:
-    """Return the record of a frame that has no result."""
-    return Record(frame.number, str(frame.output), error=str(error) or type(error).__name__)
+def failed(frame: Frame, error: BaseException) -> Record:
+    """Return the record of a frame that has no result; the traceback is logged for whoever looks for it.
+
+    Errors of input say in words what to do; of any other the type belongs to what happened.
+    """
+    _LOG.debug("frame %d failed", frame.number, exc_info=error)
+    message = " ".join(str(error).split())
+    if not (message and isinstance(error, (InputError, OSError))):
+        message = f"{type(error).__name__}: {message}".removesuffix(": ")
+    return Record(frame.number, str(frame.output), error=message)
 
 
 def _key(frame: Frame, run: Run) -> str:
