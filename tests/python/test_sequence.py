@@ -101,6 +101,19 @@ def test_frames_asked_for_need_not_exist(folders):
 
 
 @pytest.mark.parametrize(
+    ("numbers", "previous"),
+    [
+        ((7,), [None]),
+        ((1, 2, 4, 5), [None, 1, None, 4]),
+        ((1, 3, 5, 9), [None, 1, 3, None]),
+        ((10, 20, 30), [None, 10, 20]),
+    ],
+)
+def test_a_frame_knows_the_one_right_before_it(numbers, previous):
+    assert [frame.previous for frame in find_frames("f####", "o####.exr", numbers)] == previous
+
+
+@pytest.mark.parametrize(
     ("inputs", "outputs", "match"),
     [
         ("f####", "out.exr", "place for the frame's number"),

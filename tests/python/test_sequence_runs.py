@@ -194,6 +194,13 @@ def test_flicker_is_that_against_the_frame_before(frames, capfd):
     assert known == {0: False, 1: False, 2: False, 3: True}
 
 
+def test_flicker_is_not_told_across_a_gap_but_of_every_other_frame(frames, capfd):
+    shutil.rmtree("noisy/f0001")
+    for more, expected in (((), [False, False, True]), (("--frames", "0,2", "--refit", "0"), [False, True])):
+        assert main(arguments("--json", *more)) == 0
+        assert [record["flicker"] is not None for record in told(capfd)["frames"]] == expected
+
+
 def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
     (frames / "cameras/f0002.json").unlink()
@@ -560,6 +567,19 @@ def test_the_first_two_frames_fit_the_networks_of_all_others(frames, capfd):
     iterations = [record["iterations"] for record in told(capfd)["frames"]]
     assert min(iterations[:2]) > 0
     assert iterations[2:] == [0, 0]
+
+
+def test_workers_tell_no_flicker_against_a_frame_further_back(frames, capfd):
+    distributed = pytest.importorskip("distributed")
+    assert main(arguments("--frames", "1")) == 0
+    capfd.readouterr()
+    with distributed.LocalCluster(
+        n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as local:
+        assert main(arguments("--frames", "0-2", "--scheduler", local.scheduler_address, "--json")) == 0
+    records = told(capfd)["frames"]
+    assert [record["skipped"] for record in records] == [False, True, False]
+    assert records[2]["flicker"] is None
 
 
 @pytest.mark.parametrize("cameras", [True, False])

@@ -6,6 +6,7 @@ import glob
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from tungsten_dip.errors import InputError
@@ -20,12 +21,16 @@ _MOST_FRAMES = 1_000_000
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: its number, what it is read from and where its result goes, and the scene of its camera."""
+    """One frame: its number, what it is read from and where its result goes, and the scene of its camera.
+
+    ``previous`` is the number of the frame right before it, None for the first one and after a gap.
+    """
 
     number: int
     input: Path
     output: Path
     scene: Path | None = None
+    previous: int | None = None
 
 
 def numbers_from_text(text: str) -> tuple[int, ...]:
@@ -62,7 +67,7 @@ def find_frames(
     ``inputs`` has a place for the number (``####``, ``%04d``) or is a glob pattern, whose files are numbered
     by the last digits of their names. ``outputs`` has a place for the number, and so has ``scenes``, unless
     the camera stands still. Of ``numbers``, every one is a frame, whether its files exist or not; None means
-    what is there.
+    what is there. They are a step apart, that of the two closest ones: of 1, 3, 5, 9 one is missing.
 
     Raises InputError if a pattern has no place for a number, or nothing matches it.
     """
@@ -80,9 +85,11 @@ def find_frames(
     if not present:
         raise InputError(f"{inputs}: no such frames; check the pattern (quoted, so that the shell keeps it)")
     frames = []
+    step = min((after - before for before, after in pairwise(sorted(present))), default=1)
     for number, path in sorted(present.items()):
         scene = None if scenes is None else Path(_named(scenes, number))
-        frames.append(Frame(number, path, Path(_named(outputs, number)), scene))
+        previous = number - step if number - step in present else None
+        frames.append(Frame(number, path, Path(_named(outputs, number)), scene, previous))
     return frames
 
 

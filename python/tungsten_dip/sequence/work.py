@@ -60,7 +60,7 @@ class Record:
     """What became of a frame. ``how`` is as in `following.Followed`, empty without a result.
 
     ``error`` says why there is none. ``seconds`` is all that the frame took but for writing it. ``flicker``
-    is that against the frame before, where the run denoised it. ``skipped``: it was finished before.
+    is that against the frame right before, where the run denoised it. ``skipped``: it was finished before.
     """
 
     number: int
@@ -123,21 +123,24 @@ def denoise_frames(
     follower = Follower(run.settings, run.refit, models)
     frames = list(frames)
     records: list[Record] = []
+    latest: int | None = None  # the frame that was denoised last
     for index, frame in enumerate(frames):
         start, end = index / len(frames), (index + 1) / len(frames)
         part = part_of(progress, start, end, f"frame {frame.number}")
-        is_consecutive = bool(records) and records[-1].error is None and not records[-1].skipped
+        is_consecutive = latest is not None and latest == frame.previous
         try:
             record = finished(frame, run) or _denoise(frame, run, follower, is_consecutive, part)
         except Exception as error:
             record = failed(frame, error)
+        if record.error is None and not record.skipped:
+            latest = record.number
         records.append(record)
         on_record(record)
     return records, follower.models
 
 
 def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, progress: Progress) -> Record:
-    """Denoise and write a frame; ``is_consecutive``: whether the follower's last one is the one before it."""
+    """Denoise and write a frame; ``is_consecutive``: whether the follower's last one is right before it."""
     started = time.perf_counter()
     key = _key(frame, run)
     buffers = read_buffers(frame.input, run.mapping)
