@@ -1,4 +1,4 @@
-"""What Ctrl-C does while libraries load, a fit trains, a pass renders or a thread waits for another."""
+"""What Ctrl-C does while libraries load, a fit trains, a pass renders or a thread waits; SIGTERM beside workers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def interrupts_as_requests(warning: str) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         _LOG.warning(warning)
 
-    with _on_interrupt(request):
+    with _on_signal(signal.SIGINT, request):
         yield lambda: requested
 
 
@@ -58,6 +58,15 @@ def wait_in_short_turns(pending: Future[Any], between: Callable[[], None] = lamb
         between()
 
 
+def terminations_as_interrupts() -> AbstractContextManager[None]:
+    """Raise KeyboardInterrupt on SIGTERM within the block: for processes that are to end before this one."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    return _on_signal(signal.SIGTERM, interrupt)
+
+
 @contextmanager
 def _noted_interrupts(at_once: bool) -> Iterator[None]:
     pressed = False
@@ -68,21 +77,21 @@ def _noted_interrupts(at_once: bool) -> Iterator[None]:
         if at_once:
             raise KeyboardInterrupt
 
-    with _on_interrupt(note):
+    with _on_signal(signal.SIGINT, note):
         yield
     if pressed:
         raise KeyboardInterrupt
 
 
 @contextmanager
-def _on_interrupt(handle: Callable[[], None]) -> Iterator[None]:
+def _on_signal(number: signal.Signals, handle: Callable[[], None]) -> Iterator[None]:
     in_main_thread = threading.current_thread() is threading.main_thread()
     # A background job of a shell ignores Ctrl-C; None is a handler that was not installed from Python.
-    if not in_main_thread or signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):
+    if not in_main_thread or signal.getsignal(number) in (signal.SIG_IGN, None):
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: handle())
+    before = signal.signal(number, lambda _, frame: handle())
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)

@@ -525,6 +525,19 @@ def test_ctrl_c_in_a_terminal_reaches_no_local_worker():
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[True, True]\n"
 
 
+def test_a_run_on_local_workers_that_is_terminated_ends_in_one_line(frames):
+    pytest.importorskip("distributed")
+    write_frames(frames / "many", 40)
+    command = [*PROGRAM, "sequence", "many/noisy/f####", "-o", "out/f####.exr", "--workers", "2"]
+    process = subprocess.Popen([*command, "--threads", "1"], stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: outputs(frames) or process.poll() is not None)
+    process.terminate()
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error.splitlines()[-1] == "tungsten-dip: interrupted"
+    assert len(outputs(frames)) < 40
+
+
 def test_a_scheduler_that_does_not_answer_is_one_line(frames, capsys, monkeypatch):
     pytest.importorskip("distributed")
     from tungsten_dip.sequence import cluster as module

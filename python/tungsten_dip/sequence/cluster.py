@@ -19,6 +19,7 @@ from typing import Any
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
+from tungsten_dip.interrupts import terminations_as_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.sequence.following import Follower, Models
@@ -193,7 +194,8 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
                     f"--workers {workers}: they do not start ({reason:.200}); use fewer, or allow more "
                     f"memory and open files (ulimit -n)"
                 ) from error
-            yield client
+            with terminations_as_interrupts():
+                yield client
         return
     try:
         client = Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
