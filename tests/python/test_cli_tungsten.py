@@ -367,6 +367,25 @@ def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_pat
     assert err.splitlines()[-1] == "tungsten: 1 of 2 scenes failed, see above"
 
 
+def test_a_render_that_fails_does_not_keep_the_next_one_from_being_denoised(
+    tmp_path, renders, capfd, monkeypatch
+):
+    render = tungsten.render_with_mitsuba
+
+    def failing_at_first(scene, **options):
+        if scene.path.name == "a.json":
+            raise InputError(f"{scene.path}: cannot be rendered")
+        return render(scene, **options)
+
+    monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", failing_at_first)
+    scenes = write_frames(tmp_path, "a", "b")
+    assert tungsten.main(["--dip-denoise", "--dip-preset", "draft", *map(str, scenes)]) == 2
+    lines = capfd.readouterr().err.splitlines()
+    assert f"tungsten: {scenes[0]}: cannot be rendered" in lines
+    assert lines[-1] == "tungsten: 1 of 2 scenes failed, see above"
+    assert {path.name for path in tmp_path.glob("*.exr")} == {"b.exr", "b_denoised.exr"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
