@@ -577,7 +577,8 @@ def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, make_render, by)
     else:
         cut = follower.denoise(frame.buffers, frame.camera)
     assert cut.how == "cut"
-    assert follower.models == Models(alone=cut.result.model, following=None, first=first)
+    features = ("albedo", "normal", "depth")
+    assert follower.models == Models(cut.result.model, following=None, first=first, features=features)
 
 
 def test_a_frame_without_noise_makes_no_cut_of_the_next_one(make_render):
@@ -646,6 +647,25 @@ def test_frames_that_gain_features_use_them(tmp_path, with_cameras):
         how.append(followed.how)
         assert ("normal.X" in followed.result.model.blend.layout.features) == (n >= 2)
     assert how == ["fitted", "followed", "cut", "followed"]
+
+
+@pytest.mark.parametrize("with_cameras", [True, False])
+@pytest.mark.parametrize("change", ["gain", "loss"])
+def test_other_features_than_those_of_the_networks_are_a_cut(tmp_path, with_cameras, change):
+    def buffers(n):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        known = frame.buffers
+        if (n < 2) == (change == "gain"):
+            known = known.with_quantities(albedo=None)
+        return known, frame.camera if with_cameras else None
+
+    settings = replace(DRAFT, iterations=20)
+    lead = Follower(settings)
+    for n in range(2):
+        lead.denoise(*buffers(n))
+    # As a worker does that was given the networks, but not the frames that they were fitted to.
+    worker = Follower(settings, models=lead.models)
+    assert [worker.denoise(*buffers(n)).how for n in (2, 3)] == ["cut", "followed"]
 
 
 def test_flicker_is_not_told_by_halves_that_are_copies(tmp_path):

@@ -55,12 +55,14 @@ class Models:
     """The networks that frames start from, and the first frame's own.
 
     Frames whose predecessor is known start from ``following``, others from ``alone``. ``first`` is what the
-    first frame was denoised with, None if it has no noise.
+    first frame was denoised with, None if it has no noise. ``features`` are those of the latest frame, None
+    if there was none.
     """
 
     alone: Model | None = None
     following: Model | None = None
     first: Model | None = None
+    features: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class Follower:
             self.models = Models(alone=result.model, first=self.models.first)
         if self._last is None:
             self.models = replace(self.models, first=result.model)
+        self.models = replace(self.models, features=_features(buffers))
         if result.gain is not None:
             # It is estimated from the fireflies of one frame, and would flicker.
             result = replace(result, color=result.color / result.gain, gain=None)
@@ -168,8 +171,8 @@ class Follower:
         last = self._last
         if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
             raise _CutError("the previous frame had another size")
-        if last is not None and _features(last.buffers) != _features(buffers):
-            raise _CutError("the previous frame had other features")
+        if self.models.features not in (None, _features(buffers)):
+            raise _CutError("the frames before had other features")
         moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
@@ -207,9 +210,9 @@ class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
 
 
-def _features(buffers: RenderBuffers) -> list[str]:
-    of_alpha = [] if alpha_as_albedo(buffers) is None else ["alpha"]
-    return [name for name in FEATURES if buffers.get(name) is not None] + of_alpha
+def _features(buffers: RenderBuffers) -> tuple[str, ...]:
+    of_alpha = () if alpha_as_albedo(buffers) is None else ("alpha",)
+    return (*(name for name in FEATURES if buffers.get(name) is not None), *of_alpha)
 
 
 def _is_new(network: Model | None, model: Model | None) -> bool:
