@@ -668,6 +668,20 @@ def test_other_features_than_those_of_the_networks_are_a_cut(tmp_path, with_came
     assert [worker.denoise(*buffers(n)).how for n in (2, 3)] == ["cut", "followed"]
 
 
+@pytest.mark.parametrize("with_cameras", [True, False])
+def test_a_black_frame_among_albedos_in_percent_is_no_cut(tmp_path, with_cameras):
+    follower = Follower(replace(DRAFT, iterations=20))
+    how = []
+    for n in range(5):
+        frame = true_frame(tmp_path, 0.05 * n, seed=n)
+        percent = Buffer(100 * frame.buffers.albedo.mean)
+        black = Buffer(*(np.zeros_like(plane) for _, plane in frame.buffers.color.planes()))
+        color = black if n == 2 else frame.buffers.color
+        buffers = frame.buffers.with_quantities(color=color, albedo=percent)
+        how.append(follower.denoise(buffers, frame.camera if with_cameras else None).how)
+    assert how == ["fitted", "followed", "followed", "followed", "followed"]
+
+
 def test_flicker_is_not_told_by_halves_that_are_copies(tmp_path):
     follower = Follower(replace(DRAFT, iterations=5))
     for n in range(2):

@@ -55,8 +55,8 @@ class Models:
     """The networks that frames start from, and the first frame's own.
 
     Frames whose predecessor is known start from ``following``, others from ``alone``. ``first`` is what the
-    first frame was denoised with, None if it has no noise. ``features`` are those of the latest frame, None
-    if there was none.
+    first frame was denoised with, None if it has no noise. ``features`` are those of the frames so far, None
+    if they are not known.
     """
 
     alone: Model | None = None
@@ -138,7 +138,9 @@ class Follower:
             self.models = Models(alone=result.model, first=self.models.first)
         if self._last is None:
             self.models = replace(self.models, first=result.model)
-        self.models = replace(self.models, features=_features(buffers))
+        features = _features(buffers)
+        if features is not None:
+            self.models = replace(self.models, features=features)
         if result.gain is not None:
             # It is estimated from the fireflies of one frame, and would flicker.
             result = replace(result, color=result.color / result.gain, gain=None)
@@ -171,7 +173,8 @@ class Follower:
         last = self._last
         if last is not None and last.buffers.color.mean.shape != buffers.color.mean.shape:
             raise _CutError("the previous frame had another size")
-        if self.models.features not in (None, _features(buffers)):
+        features = _features(buffers)
+        if None not in (features, self.models.features) and features != self.models.features:
             raise _CutError("the frames before had other features")
         moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
@@ -210,7 +213,13 @@ class _CutError(Exception):
     """A frame that does not go on with what the one before showed."""
 
 
-def _features(buffers: RenderBuffers) -> tuple[str, ...]:
+def _features(buffers: RenderBuffers) -> tuple[str, ...] | None:
+    """Return the names of the features, None if the image is black.
+
+    It shows nothing of them, not even whether the albedo is in another scale, in which it is left out.
+    """
+    if not buffers.color.mean.any():
+        return None
     of_alpha = () if alpha_as_albedo(buffers) is None else ("alpha",)
     return (*(name for name in FEATURES if buffers.get(name) is not None), *of_alpha)
 
