@@ -168,13 +168,10 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
             throw py::value_error("expected all images in the size of the target");
         }
     }
-    if (penalty.size() != static_cast<std::size_t>(feature_image.channels)) {
-        throw py::value_error("penalty: expected one value per feature");
-    }
     Array out = array_like(target_image);
     const Image out_image = view_of(out);
     const py::gil_scoped_release release;
-    regress(target_image, feature_image, penalty.data(), guide_image, guide_variance_image,
+    regress(target_image, feature_image, penalty, guide_image, guide_variance_image,
             {.radius = radius, .step = step, .k = k}, out_image, threads);
     return out;
 }
@@ -249,13 +246,13 @@ py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, co
     Numbers by_x({x.shape(0), x.shape(1)});
     Array by_weight(x.shape(1));
     Array by_bias(x.shape(1));
-    const auto [inputs, outputs] = std::pair(x.data(), y.data());
-    const auto [by_y, to] = std::pair(gradient.data(), by_x.mutable_data());
-    const auto [means, scales] = std::pair(mean.data(), scale.data());
-    const auto [weights, biases] = std::pair(by_weight.mutable_data(), by_bias.mutable_data());
+    const BFloat16* by_y = gradient.data();
+    const Normed normed{.x = x.data(), .y = y.data(), .mean = mean.data(), .scale = scale.data()};
+    const NormActGradients out{
+        .x = by_x.mutable_data(), .weight = by_weight.mutable_data(), .bias = by_bias.mutable_data()};
     {
         const py::gil_scoped_release release;
-        norm_act_gradient(norm, inputs, outputs, means, scales, by_y, to, weights, biases);
+        norm_act_gradient(by_y, norm, normed, out);
     }
     return py::make_tuple(by_x, by_weight, by_bias);
 }

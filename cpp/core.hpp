@@ -12,6 +12,7 @@
 #include <functional>
 #include <limits>
 #include <optional>
+#include <span>
 #include <string_view>
 #include <type_traits>
 
@@ -129,9 +130,6 @@ void mend(const Buffer& buffer, Quantity quantity);
 // halves.
 void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int threads);
 
-// The mean over a square window of (2 radius + 1)^2 pixels, clipped at the borders of the image.
-void box_mean(ConstImage in, int radius, Image out, int threads);
-
 // Whether the noise of two halves is independent, as everything that scores one half by the other assumes.
 struct HalvesTest {
     // Of the two halves' errors; NaN if this image does not allow measuring it.
@@ -140,6 +138,11 @@ struct HalvesTest {
 };
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);
+
+// --- box_mean.cpp
+
+// The mean over a square window of (2 radius + 1)^2 pixels, clipped at the borders of the image.
+void box_mean(ConstImage in, int radius, Image out, int threads);
 
 // --- search_window.cpp
 
@@ -176,7 +179,7 @@ void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow wi
 // every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) - feature_c(q))^2). `penalty` has
 // one value per feature. At most 16 features; everything must be finite. Sums are float32: features should
 // differ by no more than some tens within a window; where they differ by some hundreds, results are useless.
-void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
+void regress(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
              ConstImage guide_variance, SearchWindow window, Image out, int threads);
 
 // --- steering.cpp
@@ -206,15 +209,30 @@ struct NormAct {
     const float* weight = nullptr;
     const float* bias = nullptr;
     float epsilon = 0;  // added to the variance
-    float slope = 0;    // of the leaky ReLU, below 0
+    float slope = 0;    // of the leaky ReLU, for x < 0
 };
 
 // Writes the output y and, for each channel, the mean and one over the standard deviation.
 void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, float* scale);
 
-// Given these and the gradient of y, writes the gradients of x (which may be y's in place), weight and bias.
-void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y, const float* mean,
-                       const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
-                       float* by_bias);
+// What norm_act was given and what it wrote.
+struct Normed {
+    const BFloat16* x = nullptr;
+    const BFloat16* y = nullptr;
+    const float* mean = nullptr;
+    const float* scale = nullptr;
+};
+
+// Where gradients are written: that of x, which may take the place of y's, and one of weight and bias for
+// each channel.
+struct NormActGradients {
+    BFloat16* x = nullptr;
+    float* weight = nullptr;
+    float* bias = nullptr;
+};
+
+// Writes the gradients that follow from `gradient`, that of y.
+void norm_act_gradient(const BFloat16* gradient, const NormAct& norm, const Normed& normed,
+                       const NormActGradients& out);
 
 }  // namespace tungsten_dip

@@ -170,29 +170,28 @@ void norm_act(const NormAct& norm, const BFloat16* x, BFloat16* y, float* mean, 
     });
 }
 
-void norm_act_gradient(const NormAct& norm, const BFloat16* x, const BFloat16* y, const float* mean,
-                       const float* scale, const BFloat16* gradient, BFloat16* by_x, float* by_weight,
-                       float* by_bias) {
+void norm_act_gradient(const BFloat16* gradient, const NormAct& norm, const Normed& normed,
+                       const NormActGradients& out) {
     const Traversal traversal(norm);
     const std::size_t lanes = traversal.lanes();
     const auto pixels = static_cast<double>(norm.pixels);
-    const std::vector<float> means = traversal.spread([&](std::size_t c) { return mean[c]; });
+    const std::vector<float> means = traversal.spread([&](std::size_t c) { return normed.mean[c]; });
     const Sums sums = traversal.sums(2, [&](std::size_t first, std::size_t count, float* sum) {
-        add_gradients(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope, sum,
-                      sum + lanes);
+        add_gradients(normed.x + first, normed.y + first, gradient + first, count, lanes, means.data(),
+                      norm.slope, sum, sum + lanes);
     });
     for (std::size_t c = 0; c < norm.channels; ++c) {
-        by_bias[c] = static_cast<float>(sums[0][c]);
-        by_weight[c] = static_cast<float>(sums[1][c] * scale[c]);
+        out.bias[c] = static_cast<float>(sums[0][c]);
+        out.weight[c] = static_cast<float>(sums[1][c] * normed.scale[c]);
     }
-    const auto factor = [&](std::size_t c) { return static_cast<double>(norm.weight[c]) * scale[c]; };
+    const auto factor = [&](std::size_t c) { return static_cast<double>(norm.weight[c]) * normed.scale[c]; };
     const auto factors = traversal.spread(factor);
     const auto constants = traversal.spread([&](std::size_t c) { return -factor(c) * sums[0][c] / pixels; });
     const auto linears = traversal.spread(
-        [&](std::size_t c) { return -factor(c) * scale[c] * scale[c] * sums[1][c] / pixels; });
+        [&](std::size_t c) { return -factor(c) * normed.scale[c] * normed.scale[c] * sums[1][c] / pixels; });
     traversal.for_chunks([&](std::size_t first, std::size_t count) {
-        write_gradient(x + first, y + first, gradient + first, count, lanes, means.data(), norm.slope,
-                       factors.data(), constants.data(), linears.data(), by_x + first);
+        write_gradient(normed.x + first, normed.y + first, gradient + first, count, lanes, means.data(),
+                       norm.slope, factors.data(), constants.data(), linears.data(), out.x + first);
     });
 }
 

@@ -11,6 +11,8 @@
 #include <cstddef>
 #include <cstdlib>
 #include <iterator>
+#include <optional>
+#include <span>
 #include <stdexcept>
 #include <vector>
 
@@ -269,19 +271,18 @@ TUNGSTEN_DIP_FASTEST void predict_row(const float* sums, const FeatureRows& feat
 
 class Regression {
   public:
-    Regression(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
+    Regression(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
                ConstImage guide_variance, SearchWindow window, int threads)
         : window_(window),
           threads_(threads),
-          guided_(guide.channels > 0),
           target_(target, window.radius, threads),
           features_(features, window.radius, threads),
-          guide_(guided_ ? PaddedPlanes(guide, window.radius + patch_radius, threads)
-                         : PaddedPlanes(0, 0, 0, 0)),
-          guide_variance_(guided_ ? PaddedPlanes(guide_variance, window.radius + patch_radius, threads)
-                                  : PaddedPlanes(0, 0, 0, 0)),
           coefficients_(colors * (features.channels + 1), target.height, target.width, window.radius) {
-        std::copy_n(penalty, features.channels, penalty_.begin());
+        std::ranges::copy(penalty, penalty_.begin());
+        if (guide.channels > 0) {
+            const int margin = window.radius + patch_radius;
+            guide_ = Guide{.image = {guide, margin, threads}, .variance = {guide_variance, margin, threads}};
+        }
     }
 
     void run(Image out) {
@@ -290,6 +291,11 @@ class Regression {
     }
 
   private:
+    struct Guide {
+        PaddedPlanes image;
+        PaddedPlanes variance;
+    };
+
     struct Scratch {
         std::vector<float> planes;     // [row][plane][column], of the tile and the windows of its pixels
         std::vector<float> weights;    // [row of the tile][offset in a row][column]
@@ -371,11 +377,11 @@ class Regression {
     // The weights of the tile's neighbours at one offset; 0 outside of the image, but for whole rows of them.
     void weigh(const Tile& tile, int dy, int dx, float share, Scratch& scratch, float* weights,
                std::ptrdiff_t weights_of_row) const {
-        if (guided_) compare_guide(tile, dy, dx, scratch, weights, weights_of_row);
+        if (guide_) compare_guide(*guide_, tile, dy, dx, scratch, weights, weights_of_row);
         for (int i = 0; i < tile.height; ++i, weights += weights_of_row) {
             const int y = tile.y + i;
             if (y + dy < 0 || y + dy >= target_.height()) continue;
-            if (!guided_) std::fill_n(weights, tile_width, 0.0F);
+            if (!guide_) std::fill_n(weights, tile_width, 0.0F);
             weigh_row(features_, y, tile.x, dy, dx, penalty_, share, rounded_up(tile.width, lanes), weights);
             const int first = std::clamp(-dx - tile.x, 0, tile.width);
             const int last = std::clamp(target_.width() - dx - tile.x, 0, tile.width);
@@ -385,8 +391,8 @@ class Regression {
     }
 
     // The guide's distances at one offset, averaged over patches.
-    void compare_guide(const Tile& tile, int dy, int dx, Scratch& scratch, float* distances,
-                       std::ptrdiff_t distances_of_row) const {
+    void compare_guide(const Guide& guide, const Tile& tile, int dy, int dx, Scratch& scratch,
+                       float* distances, std::ptrdiff_t distances_of_row) const {
         const int rows = tile.height + 2 * patch_radius;
         const int columns = rounded_up(tile.width + 2 * patch_radius, lanes);
         scratch.distances.resize(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns));
@@ -394,9 +400,10 @@ class Regression {
         for (int y = tile.y - patch_radius; y < tile.y + tile.height + patch_radius; ++y, row += columns) {
             const std::ptrdiff_t p = tile.x - patch_radius;
             const std::ptrdiff_t q = p + dx;
-            compare_rows(guide_.row(0, y) + p, guide_.row(0, y + dy) + q, guide_variance_.row(0, y) + p,
-                         guide_variance_.row(0, y + dy) + q, guide_.plane_size(), guide_.channels(),
-                         window_.k * window_.k, columns, row);
+            compare_rows(guide.image.row(0, y) + p, guide.image.row(0, y + dy) + q,
+                         guide.variance.row(0, y) + p, guide.variance.row(0, y + dy) + q,
+                         guide.image.plane_size(), guide.image.channels(), window_.k * window_.k, columns,
+                         row);
         }
         for (int i = 0; i < tile.height; ++i) {
             average_patches(scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns, columns,
@@ -469,23 +476,23 @@ class Regression {
     SearchWindow window_;
     FeatureValues penalty_{};
     int threads_;
-    bool guided_;
     PaddedPlanes target_;
     PaddedPlanes features_;
-    PaddedPlanes guide_;
-    PaddedPlanes guide_variance_;
+    std::optional<Guide> guide_;
     PaddedPlanes coefficients_;
 };
 
 }  // namespace
 
-void regress(ConstImage target, ConstImage features, const float* penalty, ConstImage guide,
+void regress(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
              ConstImage guide_variance, SearchWindow window, Image out, int threads) {
     if (features.channels > max_features) throw std::invalid_argument("at most 16 features");
+    if (penalty.size() != static_cast<std::size_t>(features.channels))
+        throw std::invalid_argument("penalty: expected one value per feature");
     if (target.channels != colors) throw std::invalid_argument("the target must have 3 channels");
     window.check();
     const auto valid = [](float value) { return value >= 0 && std::isfinite(value); };
-    if (!std::all_of(penalty, penalty + features.channels, valid))
+    if (!std::ranges::all_of(penalty, valid))
         throw std::invalid_argument("penalties must be finite, and none negative");
     if (target.size() == 0) return;
     Regression(target, features, penalty, guide, guide_variance, window, threads).run(out);

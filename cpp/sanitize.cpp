@@ -86,7 +86,7 @@ struct Position {
     int y, x, c;
 };
 
-// Calls visit(value) for the pixels of the 3x3 window around a position that are inside the image.
+// Calls visit(y, x) for the pixels of the 3x3 window around a position that are inside the image.
 template <typename Visit>
 void for_neighbourhood(const Image& image, Position at, const Visit& visit) {
     for (int y = std::max(at.y - 1, 0); y <= std::min(at.y + 1, image.height - 1); ++y) {

@@ -84,9 +84,12 @@ void values_and_gradients_are_those_of_the_definition(Size size, int channels) {
     std::vector<BFloat16> by_x(example.x.size());
     std::vector<float> by_weight(example.channels);
     std::vector<float> by_bias(example.channels);
-    norm_act_gradient(example.norm(), example.x.data(), example.y.data(), example.mean.data(),
-                      example.scale.data(), example.gradient.data(), by_x.data(), by_weight.data(),
-                      by_bias.data());
+    const Normed normed{.x = example.x.data(),
+                        .y = example.y.data(),
+                        .mean = example.mean.data(),
+                        .scale = example.scale.data()};
+    norm_act_gradient(example.gradient.data(), example.norm(), normed,
+                      {.x = by_x.data(), .weight = by_weight.data(), .bias = by_bias.data()});
 
     std::vector<double> x(example.x.size());
     std::ranges::transform(example.x, x.begin(), value_of);

@@ -26,7 +26,7 @@ constexpr std::array sizes{Size{.height = 1, .width = 1},  Size{.height = 1, .wi
 Pixels regressed(Pixels& target, Pixels& features, SearchWindow window, float penalty = 0.1F) {
     const std::vector<float> penalties(static_cast<std::size_t>(features.channels), penalty);
     Pixels out(target.height, target.width, 3, -1.0F);
-    regress(target.view(), features.view(), penalties.data(), {}, {}, window, out.view(), 2);
+    regress(target.view(), features.view(), penalties, {}, {}, window, out.view(), 2);
     return out;
 }
 
@@ -34,8 +34,8 @@ Pixels regressed(Pixels& target, Pixels& features, Pixels& guide, Pixels& guide_
                  int threads = 2) {
     const std::vector<float> penalty(static_cast<std::size_t>(features.channels), 0.0F);
     Pixels out(target.height, target.width, 3, -1.0F);
-    regress(target.view(), features.view(), penalty.data(), guide.view(), guide_variance.view(), window,
-            out.view(), threads);
+    regress(target.view(), features.view(), penalty, guide.view(), guide_variance.view(), window, out.view(),
+            threads);
     return out;
 }
 

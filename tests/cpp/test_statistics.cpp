@@ -44,21 +44,6 @@ void halves_variance_is_that_of_the_mean() {
     CHECK(near(sum / count, 9.0 / 8, 4 * 9.0 / 8 * std::sqrt(2 / count)));
 }
 
-void box_mean_is_clipped_at_borders() {
-    Pixels ramp(1, 5, 2);
-    for (int x = 0; x < 5; ++x) ramp.at(0, x, 1) = static_cast<float>(x);
-    Pixels out(1, 5, 2, -1.0F);
-    box_mean(ramp.view(), 1, out.view(), 1);
-    CHECK(out.at(0, 0, 1) == 0.5F && out.at(0, 2, 1) == 2 && out.at(0, 4, 1) == 3.5F && out.at(0, 3, 0) == 0);
-
-    Pixels impulse(7, 6, 1);
-    impulse.at(3, 3) = 25;
-    Pixels spread(7, 6, 1);
-    box_mean(impulse.view(), 2, spread.view(), 3);
-    CHECK(near(spread.at(3, 3), 1, 1e-6) && near(spread.at(1, 3), 1.25, 1e-6) && spread.at(0, 3) == 0);
-    CHECK(near(spread.at(3, 5), 25.0 / 15, 1e-5));
-}
-
 HalvesTest compare(Render& render, bool with_variance) {
     return compare_halves(render.half_a.view(), render.half_b.view(),
                           with_variance ? render.variance.view() : Image{}, 2);
@@ -189,7 +174,6 @@ void threads_do_not_matter() {
 
 int main() {
     halves_variance_is_that_of_the_mean();
-    box_mean_is_clipped_at_borders();
     independent_halves_pass();
     mirrored_halves_fail();
     shared_samples_fail();
