@@ -68,12 +68,13 @@ BufferBlocks blocks_of(const Tungsten::OutputBuffer<T>& buffer) {
 }
 
 // Memory for the means of RenderBuffers, one array per quantity, all pages touched.
-std::vector<std::vector<float>> means_for(const Tungsten::Camera& camera, bool features);
+std::vector<std::vector<float>> means_for(const Tungsten::Camera& camera, bool writes_features);
 
-// Turns the camera's buffers into RenderBuffers. With `take` they are moved out of the camera and nothing is
-// copied; otherwise the render may go on. Without `features` the integrator fills colour alone, and in part
-// by splatting.
-RenderBuffers buffers_of(Tungsten::Camera& camera, std::uint32_t spp, bool features,
-                         std::vector<std::vector<float>> means, bool take);
+// The camera's buffers as RenderBuffers: copies, after which the render may go on, or the buffers themselves,
+// moved out of the camera, with the memory of `means_for` for the means. An integrator that writes no
+// features fills colour alone, and in part by splatting.
+RenderBuffers copied_buffers(Tungsten::Camera& camera, std::uint32_t spp, bool writes_features);
+RenderBuffers taken_buffers(Tungsten::Camera& camera, std::uint32_t spp, bool writes_features,
+                            std::vector<std::vector<float>> means);
 
 }  // namespace tungsten_dip

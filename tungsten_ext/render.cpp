@@ -316,16 +316,13 @@ void Render::Impl::save_as_asked(const OutputBuffer<T>& buffer, const OutputBuff
 
 RenderBuffers Render::buffers() const {
     const std::uint32_t spp = current_spp();  // throws where there is no scene any more
-    Camera& camera = *impl_->scene->camera();
-    const bool features = impl_->plan.writes_features;
-    return buffers_of(camera, spp, features, means_for(camera, features), false);
+    return copied_buffers(*impl_->scene->camera(), spp, impl_->plan.writes_features);
 }
 
 RenderBuffers Render::take_buffers() {
     const std::uint32_t spp = current_spp();  // throws where there is no scene any more
-    Camera& camera = *impl_->scene->camera();
     RenderBuffers buffers =
-        buffers_of(camera, spp, impl_->plan.writes_features, std::move(impl_->means), true);
+        taken_buffers(*impl_->scene->camera(), spp, impl_->plan.writes_features, std::move(impl_->means));
     impl_->traceable.reset();
     impl_->scene.reset();
     return buffers;

@@ -1,5 +1,6 @@
 // The hook: from the camera's output buffers to the arrays that a fit reads.
 #include <algorithm>
+#include <cstdint>
 #include <memory>
 #include <thread>
 #include <type_traits>
@@ -72,20 +73,10 @@ class BufferMemory {
     std::vector<std::vector<float>> arrays_;
 };
 
-}  // namespace
+enum class Access : std::uint8_t { copy, take };
 
-std::vector<std::vector<float>> means_for(const Camera& camera, bool features) {
-    const std::size_t pixels = camera.resolution().product();
-    std::vector<std::vector<float>> means;
-    for_each_quantity([&](OutputBufferTypeEnum type, const char*, auto member) {
-        using Value = std::decay_t<decltype((*(camera.*member))[0])>;
-        if (type == OutputColor || features) means.emplace_back(pixels * channels_of<Value>);
-    });
-    return means;
-}
-
-RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
-                         std::vector<std::vector<float>> means, bool take) {
+RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool writes_features,
+                         std::vector<std::vector<float>> means, Access access) {
     const auto owner = std::make_shared<BufferMemory>();
     BufferMemory& memory = *owner;
     const Vec2u size = camera.resolution();
@@ -98,7 +89,7 @@ RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
                           .uniform_spp = static_cast<float>(spp),
                           .memory = owner};
 
-    if (!features) {
+    if (!writes_features) {
         // Light also arrives by splatting, which no half contains: only the whole image is sound.
         float* mean = memory.own(std::move(means[0]));
         parallel_ranges(pixels, [&](std::uint32_t begin, std::uint32_t end) {
@@ -120,7 +111,7 @@ RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
         const std::size_t floats = pixels * channels;
         // What is taken is ours alone from here on; otherwise the render still needs it as it is.
         const auto array = [&](const float* block) {
-            return take ? const_cast<float*>(block) : memory.own({block, block + floats});
+            return access == Access::take ? const_cast<float*>(block) : memory.own({block, block + floats});
         };
         const QuantityPlanes quantity{.name = name,
                                       .channels = static_cast<int>(channels),
@@ -141,9 +132,30 @@ RenderBuffers buffers_of(Camera& camera, std::uint32_t spp, bool features,
                 buffers.spp = memory.own({first, last});
             }
         }
-        if (take) memory.own(std::move(buffer));
+        if (access == Access::take) memory.own(std::move(buffer));
     });
     return buffers;
+}
+
+}  // namespace
+
+std::vector<std::vector<float>> means_for(const Camera& camera, bool writes_features) {
+    const std::size_t pixels = camera.resolution().product();
+    std::vector<std::vector<float>> means;
+    for_each_quantity([&](OutputBufferTypeEnum type, const char*, auto member) {
+        using Value = std::decay_t<decltype((*(camera.*member))[0])>;
+        if (type == OutputColor || writes_features) means.emplace_back(pixels * channels_of<Value>);
+    });
+    return means;
+}
+
+RenderBuffers copied_buffers(Camera& camera, std::uint32_t spp, bool writes_features) {
+    return buffers_of(camera, spp, writes_features, means_for(camera, writes_features), Access::copy);
+}
+
+RenderBuffers taken_buffers(Camera& camera, std::uint32_t spp, bool writes_features,
+                            std::vector<std::vector<float>> means) {
+    return buffers_of(camera, spp, writes_features, std::move(means), Access::take);
 }
 
 }  // namespace tungsten_dip
