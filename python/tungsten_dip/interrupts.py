@@ -1,4 +1,4 @@
-"""What Ctrl-C does while libraries load, a fit trains, a pass renders or a thread waits; SIGTERM beside workers."""
+"""What Ctrl-C does while libraries load, a fit trains or a thread waits; and SIGTERM beside workers."""
 
 from __future__ import annotations
 
