@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fitted_models import DRAFT, evidence_of
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
+from tungsten_dip.fit.clock import Clock
+from tungsten_dip.fit.denoised import denoised_image
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.lost_detail import with_lost_detail
 
 SHAPE = (40, 56, 3)
@@ -34,6 +39,18 @@ def test_what_both_halves_show_is_given_back(lost: float, leaked: float) -> None
     mean = (given[0] + given[1]) / 2
     np.testing.assert_allclose(mean[10:13, 20:24].mean(), lost, rtol=0.1)
     assert np.abs(mean[20:] - leaked).mean() < 0.002
+
+
+def test_all_samples_keep_what_is_given_back() -> None:
+    truth = np.full(SHAPE, 0.2, np.float32)
+    truth[10:13, 20:24] = 1.6
+    a, b = _halves(truth, 32.0)
+    evidence = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
+    flat = np.full(SHAPE, 0.2 * evidence.scale, np.float32)
+    result = denoised_image(evidence, (flat, flat), flat, DRAFT, Clock())
+    assert not any("is returned" in note for note in result.notes)
+    assert result.color[10:13, 20:24].mean() > 1.4
+    np.testing.assert_allclose(result.color, (result.halves[0] + result.halves[1]) / 2, rtol=1e-6)
 
 
 def test_nothing_is_given_back_on_the_word_of_one_half() -> None:

@@ -71,17 +71,20 @@ def denoised_image(
     result is that of a network without training (``iterations`` 0), and without its ``model``.
     """
     threads = evidence.threads
+    blended = mean_of(denoised)
     denoised = with_lost_detail(evidence.halves, denoised, evidence.halves_drawn)
     image = mean_of(denoised)
     if all_samples_blend is not None:
-        image = with_all_samples(denoised, all_samples_blend, threads)
+        # What the halves' blends lost, that of all samples lost with the same weights.
+        image = with_all_samples(denoised, all_samples_blend + (image - blended), threads)
     pixels = denoised[0].reshape(-1, 3), denoised[1].reshape(-1, 3)
     error = estimate_error(evidence.candidates, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 
     # The error of the plain mean, by the same evidence.
     half_a, half_b = evidence.halves
     squared: FloatArray = np.float32(0.25) * (half_a - half_b) ** 2
-    error_of_input = float((squared / (image**2 + np.float32(RELMSE_EPSILON))).mean(dtype=np.float64))
+    denominator = mean_of(denoised) ** 2 + np.float32(RELMSE_EPSILON)
+    error_of_input = float((squared / denominator).mean(dtype=np.float64))
     estimated, _ = error_from_halves(evidence.halves, pixels, np.float32(RELMSE_EPSILON))
     notes = evidence.notes
     if estimated >= error_of_input:
