@@ -17,8 +17,10 @@ from unittest import mock
 from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, all_samples, blending, denoise, evidence, surfaces
-from tungsten_dip.fit.layout import Pilot
+from tungsten_dip.fit import FitSettings, blending, denoise, evidence
+from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.output import all_samples
+from tungsten_dip.fit.pilots import surfaces
 from tungsten_dip.report.metrics import compare
 
 Change = Callable[[], AbstractContextManager[object]]

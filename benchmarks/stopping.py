@@ -16,9 +16,9 @@ import numpy as np
 from tungsten_dip.bench.sets import BenchSet, read_sets
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, blending, denoise
-from tungsten_dip.fit.blend_network import BlendNetwork, Examples
+from tungsten_dip.fit.network.blend_network import BlendNetwork, Examples
+from tungsten_dip.fit.network.training import Start, start_of_training
 from tungsten_dip.fit.settings import Preset
-from tungsten_dip.fit.training import Start, start_of_training
 from tungsten_dip.report.metrics import compare
 
 PRESETS: tuple[Preset, ...] = ("draft", "balanced")

@@ -11,7 +11,7 @@ from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.splitting import HalvedImage
+from tungsten_dip.fit.preparation.splitting import HalvedImage
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import silent

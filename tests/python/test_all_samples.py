@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tungsten_dip.fit.all_samples import with_all_samples
+from tungsten_dip.fit.output.all_samples import with_all_samples
 
 SHAPE = (9, 14, 3)
 

@@ -8,7 +8,7 @@ import pytest
 from conftest import SyntheticRender
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, Halves
 from tungsten_dip.fit import FitSettings, denoise
-from tungsten_dip.fit.error import crossed_errors, estimate_error, held_out_error
+from tungsten_dip.fit.output.error import crossed_errors, estimate_error, held_out_error
 
 PIXELS = 10_000
 TRUTH = 1.0

@@ -9,12 +9,14 @@ import pytest
 
 from conftest import MakeRender
 from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
-from tungsten_dip.fit import FitSettings, all_samples, denoise, evidence, training
+from tungsten_dip.fit import FitSettings, denoise, evidence
 from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.exposure import unscaled
-from tungsten_dip.fit.inputs import loss_weights
-from tungsten_dip.fit.pilots import PilotMaker
-from tungsten_dip.fit.scoring import ErrorMeasure, _caps, _denominators
+from tungsten_dip.fit.network import training
+from tungsten_dip.fit.network.inputs import loss_weights
+from tungsten_dip.fit.network.scoring import ErrorMeasure, _caps, _denominators
+from tungsten_dip.fit.output import all_samples
+from tungsten_dip.fit.pilots.maker import PilotMaker
+from tungsten_dip.fit.preparation.exposure import unscaled
 
 
 def test_guides_are_as_noisy_as_is_said_of_them(

@@ -7,8 +7,9 @@ import numpy.typing as npt
 import pytest
 
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.fit import FitSettings, denoise, fireflies
-from tungsten_dip.fit.fireflies import limit_fireflies
+from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.preparation import fireflies
+from tungsten_dip.fit.preparation.fireflies import limit_fireflies
 from tungsten_dip.sequence.following import Follower
 
 

@@ -19,20 +19,17 @@ from tungsten_dip import interrupts
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, blending, denoise, training
-from tungsten_dip.fit.all_samples import pilots_of_all_samples
-from tungsten_dip.fit.blend_network import Examples
+from tungsten_dip.fit import FitSettings, blending, denoise
 from tungsten_dip.fit.blending import fit_blend
-from tungsten_dip.fit.layout import Pilot
-from tungsten_dip.fit.pilots import (
-    BALANCED_PILOTS,
-    DRAFT_PILOTS,
-    PilotMaker,
-    first_guides,
-)
-from tungsten_dip.fit.preparation import prepare_input
-from tungsten_dip.fit.surfaces import Surfaces, surfaces_of_halves
-from tungsten_dip.fit.training import Training, _batches
+from tungsten_dip.fit.network import training
+from tungsten_dip.fit.network.blend_network import Examples
+from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.network.training import Training, _batches
+from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
+from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.presets import BALANCED_PILOTS, DRAFT_PILOTS
+from tungsten_dip.fit.pilots.surfaces import Surfaces, surfaces_of_halves
+from tungsten_dip.fit.preparation.prepare import prepare_input
 from tungsten_dip.progress import silent
 
 
@@ -297,7 +294,7 @@ def oidn_images(monkeypatch: pytest.MonkeyPatch) -> list[FloatImage]:
     def given(buffers: RenderBuffers, colors: Any, scale: float, threads: int) -> tuple[FloatImage, ...]:
         return tuple(image * np.float32(scale) for image in images)
 
-    for module in ("evidence", "all_samples"):
+    for module in ("evidence", "output.all_samples"):
         monkeypatch.setattr(f"tungsten_dip.fit.{module}.oidn_pilot", given)
     return images
 

@@ -12,7 +12,7 @@ from fitted_models import DRAFT, check_result
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.preparation import prepare_input
+from tungsten_dip.fit.preparation.prepare import prepare_input
 
 
 @pytest.mark.parametrize("spoil", ["sums", "another picture", "little of another layer"])

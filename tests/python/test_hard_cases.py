@@ -88,7 +88,7 @@ def test_halves_are_tested_alike_at_any_exposure(exponent: int) -> None:
 
 @pytest.mark.parametrize("preset", ["draft", "balanced", "final"])
 def test_a_learning_rate_too_high_does_no_harm(preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tungsten_dip.fit.training.LEARNING_RATE", 1.0)
+    monkeypatch.setattr("tungsten_dip.fit.network.training.LEARNING_RATE", 1.0)
     result = denoise(healthy().buffers, replace(DRAFT, preset=preset))
     assert not measure(result, healthy()).broken(HardCase("Settings", preset, healthy))
 

@@ -8,9 +8,9 @@ import pytest
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import denoised_image
-from tungsten_dip.fit.layout import Pilot
-from tungsten_dip.fit.lost_detail import with_lost_detail
+from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.output.denoised import denoised_image
+from tungsten_dip.fit.output.lost_detail import with_lost_detail
 
 SHAPE = (40, 56, 3)
 

@@ -6,7 +6,8 @@ import pytest
 from conftest import relmse
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, denoise, oidn
+from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.pilots import oidn
 
 
 def image(render, *, albedo=True, normal=True, **options):

@@ -16,12 +16,12 @@ from fitted_models import DRAFT, paper_model, session_of
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, inference
-from tungsten_dip.fit.blend_network import Examples, first_weights
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
-from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
-from tungsten_dip.fit.standardisation import Standardisation
+from tungsten_dip.fit.network.blend_network import Examples, first_weights
+from tungsten_dip.fit.network.layout import Layout, Pilot
+from tungsten_dip.fit.network.standardisation import Standardisation
 from tungsten_dip.onnx import infer
 from tungsten_dip.onnx.file import proto_from_model
 from tungsten_dip.progress import silent

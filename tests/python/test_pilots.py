@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.fit.layout import Pilot
-from tungsten_dip.fit.pilots import (
-    PilotMaker,
-    first_guides,
-)
-from tungsten_dip.fit.surfaces import Surfaces, divisor, surfaces_of_halves
+from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.surfaces import Surfaces, divisor, surfaces_of_halves
 
 Plane = np.ndarray
 

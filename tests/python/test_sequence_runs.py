@@ -354,7 +354,7 @@ def test_ctrl_c_keeps_what_is_finished_and_nothing_else(frames, capsys, monkeypa
 
 
 def test_a_fit_cut_short_by_ctrl_c_is_not_saved(frames, monkeypatch):
-    import tungsten_dip.fit.training as training
+    import tungsten_dip.fit.network.training as training
 
     def interrupted(*_):
         raise KeyboardInterrupt

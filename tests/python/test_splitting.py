@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
-from tungsten_dip.fit.splitting import with_independent_halves
+from tungsten_dip.fit.preparation.splitting import with_independent_halves
 
 
 def _gamma_noise(shape: float) -> RenderBuffers:

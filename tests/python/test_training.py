@@ -10,11 +10,12 @@ import pytest
 
 from conftest import MakeRender, SyntheticRender
 from tungsten_dip.buffers.render_buffers import Indices
-from tungsten_dip.fit import FitSettings, blending, denoise, training
-from tungsten_dip.fit.blend_network import HIDDEN, BlendNetwork, Examples
+from tungsten_dip.fit import FitSettings, blending, denoise
 from tungsten_dip.fit.evidence import Evidence
+from tungsten_dip.fit.network import training
+from tungsten_dip.fit.network.blend_network import HIDDEN, BlendNetwork, Examples
+from tungsten_dip.fit.network.training import LEARNING_RATE
 from tungsten_dip.fit.settings import Preset
-from tungsten_dip.fit.training import LEARNING_RATE
 
 
 def test_the_pixels_that_tell_the_error_are_not_trained_on(

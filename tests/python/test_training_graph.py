@@ -13,12 +13,18 @@ from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
 from tungsten_dip.buffers.render_buffers import FloatArray
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.blend_network import BlendNetwork, Examples, first_weights, training_step, weight_shapes
 from tungsten_dip.fit.evidence import with_best_baseline
-from tungsten_dip.fit.inputs import INPUTS_RADIUS, inputs_of_half, loss_weights, network_inputs
-from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.training import start_of_training
+from tungsten_dip.fit.network.blend_network import (
+    BlendNetwork,
+    Examples,
+    first_weights,
+    training_step,
+    weight_shapes,
+)
+from tungsten_dip.fit.network.inputs import INPUTS_RADIUS, inputs_of_half, loss_weights, network_inputs
+from tungsten_dip.fit.network.layout import Layout, Pilot
+from tungsten_dip.fit.network.training import start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx import infer
 

@@ -19,9 +19,10 @@ from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitResult, denoise, training
+from tungsten_dip.fit import FitResult, denoise
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.network import training
 from tungsten_dip.onnx import infer, load_model, save_model
 from tungsten_dip.progress import silent
 
@@ -282,7 +283,7 @@ def test_another_preset_than_the_models_is_named(
 
 def test_onnxruntime_keeps_no_telemetry(tmp_path: Path) -> None:
     program = (
-        "from tungsten_dip.fit.blend_network import training_step\n"
+        "from tungsten_dip.fit.network.blend_network import training_step\n"
         "from tungsten_dip.graphs.sessions import session_from_proto\n"
         "session_from_proto(training_step(2, 2), 1)"
     )

@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tungsten_dip.fit.blend_network import Examples
 from tungsten_dip.fit.model import Weights
+from tungsten_dip.fit.network.blend_network import Examples
 
 LEAKY_SLOPE = 0.2
 
 
 class TorchNetwork:
-    """Trained like `tungsten_dip.fit.blend_network.BlendNetwork`; gradients are autograd's."""
+    """Trained like `tungsten_dip.fit.network.blend_network.BlendNetwork`; gradients are autograd's."""
 
     def __init__(self, weights: Weights) -> None:
         self._parameters = {

@@ -200,7 +200,7 @@ def _learning_rates() -> Row:
     lost = []
     ways = {preset: _few(preset) for preset in ("draft", "balanced", "final")} | {"paper": PAPER}
     with (
-        mock.patch("tungsten_dip.fit.training.LEARNING_RATE", 1.0),
+        mock.patch("tungsten_dip.fit.network.training.LEARNING_RATE", 1.0),
         mock.patch("tungsten_dip.fit.paper.fit.LEARNING_RATE", 0.1),
     ):
         for path, settings in ways.items():

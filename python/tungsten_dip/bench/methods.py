@@ -17,8 +17,8 @@ from tungsten_dip.bench.sets import BenchSet
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.oidn import Quality, oidn_image
 from tungsten_dip.fit.paper.constants import ITERATIONS
+from tungsten_dip.fit.pilots.oidn import Quality, oidn_image
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings, Preset
 from tungsten_dip.hosts import render
 from tungsten_dip.progress import Progress

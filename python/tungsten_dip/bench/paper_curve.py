@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.fit.paper.images import paper_images
-from tungsten_dip.fit.preparation import prepare_input
+from tungsten_dip.fit.preparation.prepare import prepare_input
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress
 

@@ -25,7 +25,7 @@ from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.extras import require
 from tungsten_dip.fit.paper.images import paper_images
-from tungsten_dip.fit.preparation import prepare_input
+from tungsten_dip.fit.preparation.prepare import prepare_input
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.progress import Progress, silent
 

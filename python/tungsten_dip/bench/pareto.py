@@ -16,7 +16,7 @@ from tungsten_dip.bench.table import Row, SetRows, markdown_table, repeats_text
 from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.extras import require
 from tungsten_dip.fit import FitSettings, denoise
-from tungsten_dip.fit.oidn import oidn_image
+from tungsten_dip.fit.pilots.oidn import oidn_image
 from tungsten_dip.hosts import render
 from tungsten_dip.progress import Progress, silent
 

@@ -8,7 +8,7 @@ from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.errors import check_type
 from tungsten_dip.extras import require
 from tungsten_dip.fit.model import Model, check_settings
-from tungsten_dip.fit.preparation import finish_result, prepare_input
+from tungsten_dip.fit.preparation.prepare import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.interrupts import deferred_interrupts

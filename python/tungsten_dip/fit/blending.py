@@ -17,25 +17,25 @@ from typing import Self
 
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import in_pair
-from tungsten_dip.fit.all_samples import pilots_of_all_samples
-from tungsten_dip.fit.blend_network import BlendNetwork
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
-from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model, source_sha256
-from tungsten_dip.fit.pilots import (
+from tungsten_dip.fit.network.blend_network import BlendNetwork
+from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.network.training import start_of_training, train
+from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
+from tungsten_dip.fit.output.denoised import denoised_image, result_without_noise
+from tungsten_dip.fit.pilots.presets import (
     BALANCED_PILOTS,
     DRAFT_PILOTS,
     FINAL_PILOTS,
     FOLLOWING_DRAFT_PILOTS,
     FOLLOWING_PILOTS,
 )
+from tungsten_dip.fit.preparation.splitting import with_independent_halves
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.splitting import with_independent_halves
 from tungsten_dip.fit.stages import stage
-from tungsten_dip.fit.training import start_of_training, train
 from tungsten_dip.interrupts import wait_in_short_turns
 from tungsten_dip.progress import Progress
 

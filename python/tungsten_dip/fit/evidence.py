@@ -18,23 +18,17 @@ from tungsten_dip.buffers.render_buffers import (
 )
 from tungsten_dip.cores import thread_count
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.exposure import exposure, scaled
-from tungsten_dip.fit.fireflies import Limited, limit_fireflies
-from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.oidn import oidn_pilot
-from tungsten_dip.fit.pilots import (
-    DRAFT_PILOTS,
-    FOLLOWING_PILOTS,
-    Guides,
-    PilotMaker,
-    first_guides,
-    following_guides,
-)
-from tungsten_dip.fit.scoring import ErrorMeasure, best_candidate, error_measure
+from tungsten_dip.fit.network.layout import Layout, Pilot
+from tungsten_dip.fit.network.scoring import ErrorMeasure, best_candidate, error_measure
+from tungsten_dip.fit.pilots.maker import Guides, PilotMaker, first_guides, following_guides
+from tungsten_dip.fit.pilots.oidn import oidn_pilot
+from tungsten_dip.fit.pilots.presets import DRAFT_PILOTS, FOLLOWING_PILOTS
+from tungsten_dip.fit.pilots.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
+from tungsten_dip.fit.preparation.exposure import exposure, scaled
+from tungsten_dip.fit.preparation.fireflies import Limited, limit_fireflies
+from tungsten_dip.fit.preparation.splitting import HalvedImage
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.splitting import HalvedImage
 from tungsten_dip.fit.stages import stage
-from tungsten_dip.fit.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
 from tungsten_dip.progress import Progress
 
 _NEAR_RADIUS = 2

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers
-from tungsten_dip.fit.all_samples import pilots_of_all_samples
-from tungsten_dip.fit.blend_network import BlendNetwork
 from tungsten_dip.fit.blending import blended_images, blends_all_samples
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.denoised import denoised_image, result_without_noise
 from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
-from tungsten_dip.fit.inputs import INPUTS_RADIUS, network_inputs
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.network.blend_network import BlendNetwork
+from tungsten_dip.fit.network.inputs import INPUTS_RADIUS, network_inputs
+from tungsten_dip.fit.network.standardisation import Standardisation
+from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
+from tungsten_dip.fit.output.denoised import denoised_image, result_without_noise
+from tungsten_dip.fit.preparation.splitting import with_independent_halves
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.splitting import with_independent_halves
-from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.progress import Progress
 
 _BAND_PIXELS = 1 << 18

@@ -28,10 +28,10 @@ class FitResult:
     ``estimated_relmse`` is the estimated relMSE (with epsilon 0.01) of the mean of ``halves``, and ``error``
     its estimated relative squared error around every pixel, shape (height, width, 1), the mean over 9x9
     pixels. ``halves`` and both errors are None with the preset paper.
-    ``gain``, shape (height, width, 1), gives back some of the radiance of fireflies (`fit.fireflies`); None
+    ``gain``, shape (height, width, 1), gives back some of the radiance of fireflies (`fireflies`); None
     without fireflies. The errors do not include what is lost of it.
     ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it
-    (`fit.splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
+    (`splitting`). ``model`` is the fitted network, None where there was no noise to fit one to.
     ``interrupted`` indicates that Ctrl-C ended the fit early. ``notes`` are one line each, for example on
     missing buffers.
     """

@@ -1,4 +1,4 @@
-"""The graphs of the networks: what `fit.blend_network` and `fit.paper.networks` compute, in plain operators.
+"""The graphs of the networks: what `fit.network` and `fit.paper` compute, in plain operators.
 
 The height and width of the inputs are free. The images of a batch are independent: the batch
 norms of the preset paper, which always use the statistics of the batch in hand, are instance norms here.
@@ -14,9 +14,10 @@ import onnx
 from onnx import TensorProto
 
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.blend_network import HIDDEN, members_of
-from tungsten_dip.fit.blend_network import LEAKY_SLOPE as BLEND_SLOPE
 from tungsten_dip.fit.model import Model, Weights
+from tungsten_dip.fit.network.blend_network import HIDDEN, members_of
+from tungsten_dip.fit.network.blend_network import LEAKY_SLOPE as BLEND_SLOPE
+from tungsten_dip.fit.network.standardisation import LARGEST_INPUT
 from tungsten_dip.fit.paper.constants import (
     LEAKY_SLOPE,
     NORM_EPSILON,
@@ -25,7 +26,6 @@ from tungsten_dip.fit.paper.constants import (
     SIDE_CHANNELS,
     SIDE_SCALES,
 )
-from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
 _MOST_MEMBERS = 16

@@ -16,7 +16,7 @@ from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.model import Model, check_finite, check_inputs
 from tungsten_dip.fit.paper.images import network_input, paper_images
-from tungsten_dip.fit.preparation import finish_result, prepare_input
+from tungsten_dip.fit.preparation.prepare import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto

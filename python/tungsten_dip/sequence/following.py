@@ -22,10 +22,10 @@ from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.model import Model
-from tungsten_dip.fit.preparation import finish_result, prepare_input
+from tungsten_dip.fit.pilots.surfaces import alpha_as_albedo
+from tungsten_dip.fit.preparation.prepare import finish_result, prepare_input
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
-from tungsten_dip.fit.surfaces import alpha_as_albedo
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker

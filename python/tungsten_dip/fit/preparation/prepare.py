@@ -13,8 +13,8 @@ from tungsten_dip.buffers.half_buffers import without_foreign_halves, without_si
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.fit.preparation.splitting import with_lost_halves_drawn
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.splitting import with_lost_halves_drawn
 
 _LOG = logging.getLogger(__name__)
 

@@ -17,10 +17,10 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import PILOTS_SHARE, Evidence, occupied_pixels
-from tungsten_dip.fit.oidn import oidn_pilot
-from tungsten_dip.fit.pilots import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.oidn import oidn_pilot
+from tungsten_dip.fit.pilots.surfaces import surfaces_of_halves
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.surfaces import surfaces_of_halves
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25

@@ -21,8 +21,8 @@ from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
 from tungsten_dip.buffers.prefilter import noise_in
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.fit.exposure import exposure, scaled
 from tungsten_dip.fit.neighbours import largest_around, mean_around
+from tungsten_dip.fit.preparation.exposure import exposure, scaled
 
 _Plane = npt.NDArray[np.float64]
 

@@ -9,12 +9,17 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves, RenderBuffers, mean_of
 from tungsten_dip.cores import thread_count
-from tungsten_dip.fit.all_samples import with_all_samples
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.error import bounded_ratio, epsilon_of_renderer, error_from_halves, estimate_error
 from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.exposure import exposure, unscaled
-from tungsten_dip.fit.lost_detail import with_lost_detail
+from tungsten_dip.fit.output.all_samples import with_all_samples
+from tungsten_dip.fit.output.error import (
+    bounded_ratio,
+    epsilon_of_renderer,
+    error_from_halves,
+    estimate_error,
+)
+from tungsten_dip.fit.output.lost_detail import with_lost_detail
+from tungsten_dip.fit.preparation.exposure import exposure, unscaled
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress

@@ -15,7 +15,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
-from tungsten_dip.fit.exposure import scaled
+from tungsten_dip.fit.preparation.exposure import scaled
 
 _LOG = logging.getLogger(__name__)
 

@@ -10,18 +10,18 @@ import numpy as np
 
 from tungsten_dip.buffers.render_buffers import FloatArray, Halves, Indices
 from tungsten_dip.cores import in_pair
-from tungsten_dip.fit.blend_network import BlendNetwork, Examples, first_weights
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.error import estimate_error, held_out_error
 from tungsten_dip.fit.evidence import Evidence, with_best_baseline
-from tungsten_dip.fit.inputs import (
+from tungsten_dip.fit.model import Blend, Model, Weights
+from tungsten_dip.fit.network.blend_network import BlendNetwork, Examples, first_weights
+from tungsten_dip.fit.network.inputs import (
     loss_weights,
     network_inputs,
 )
-from tungsten_dip.fit.model import Blend, Model, Weights
+from tungsten_dip.fit.network.standardisation import LARGEST_INPUT, standardisation_of
+from tungsten_dip.fit.output.error import estimate_error, held_out_error
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
-from tungsten_dip.fit.standardisation import LARGEST_INPUT, standardisation_of
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2
@@ -71,7 +71,7 @@ class Start:
 def start_of_training(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
     """Return the examples, and the weights of ``model`` or, if its image was too different, new ones.
 
-    New weights are those of so many ``members`` (`fit.blend_network`).
+    New weights are those of so many ``members`` (`fit.network.blend_network`).
     """
     inputs = network_inputs(evidence)
     notes: tuple[str, ...] = ()

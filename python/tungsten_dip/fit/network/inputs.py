@@ -16,8 +16,8 @@ from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
 from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.layout import SCORE_RADII
 from tungsten_dip.fit.neighbours import mean_around, signed_mean_around
+from tungsten_dip.fit.network.layout import SCORE_RADII
 
 INPUTS_RADIUS = max(SCORE_RADII)
 

@@ -1,0 +1,1 @@
+"""What is done with the noisy image before anything is computed from it."""
