@@ -6,6 +6,7 @@ import json
 import logging
 import string
 import struct
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -726,6 +727,45 @@ def test_damaged_bytes_read_or_are_refused(tmp_path: Path, capfd: pytest.Capture
             refusals += 1
     assert refusals > 0
     assert capfd.readouterr() == ("", ""), "the libraries must not print"
+
+
+@pytest.mark.parametrize("several_parts", [False, True])
+@pytest.mark.parametrize(
+    ("value", "stored", "damaged", "reason"),
+    [
+        ("cafe", b"cafe", b"caf\xe9", r"expected text in UTF-8, got 'caf\xe9'"),
+        (["a", "cafe"], b"cafe", b"caf\xe9", r"expected text in UTF-8, got 'caf\xe9'"),
+        (Fraction(24, 7), b"\x18\0\0\0\7\0\0\0", b"\x18" + bytes(7), "got one whose denominator is 0"),
+        (Fraction(24, 7), b"\x18\0\0\0\7\0\0\0", bytes(8), "got one whose denominator is 0"),
+    ],
+)
+def test_attributes_that_python_cannot_hold_are_left_out_and_told(
+    tmp_path: Path,
+    value: object,
+    stored: bytes,
+    damaged: bytes,
+    reason: str,
+    several_parts: bool,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    header = {"type": OpenEXR.scanlineimage, "bad": value, "good": ["x" * 200, "y"]}
+    parts = [OpenEXR.Part(dict(header), {n: pixels(i) for i, n in enumerate("RGB")}, "rgba")]
+    if several_parts:
+        parts.append(OpenEXR.Part(dict(header), {"Z": pixels(3)}, "depth"))
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    whole = read_buffers(tmp_path / "a.exr")
+    (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes().replace(stored, damaged))
+    caplog.clear()
+    buffers = read_buffers(tmp_path / "a.exr")
+    np.testing.assert_array_equal(buffers.color.mean, whole.color.mean)
+    assert (buffers.depth is not None) == several_parts
+    assert whole.attributes.keys() - buffers.attributes.keys() == {"bad"}
+    assert buffers.attributes["good"] == header["good"]
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(lines) == len(parts)
+    assert lines[0].startswith(f"{tmp_path / 'a.exr'}: attribute bad is left out: ")
+    assert lines[0].endswith(reason)
+    assert image_file.read_attributes(tmp_path / "a.exr").keys() >= {"dataWindow", "good"}
 
 
 def test_a_header_that_claims_too_much_is_refused(tmp_path: Path) -> None:

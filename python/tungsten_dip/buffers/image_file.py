@@ -24,6 +24,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import check_suffix, is_utf8, replacing
+from tungsten_dip.buffers.exr_header import read_headers
 from tungsten_dip.buffers.render_buffers import FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
@@ -101,7 +102,7 @@ def read_parts(path: Path) -> tuple[Part, ...]:
         raise
     except MemoryError as error:
         raise InputError(f"{path}: not enough memory to read it ({error}); free some, or crop it") from error
-    except (RuntimeError, ValueError) as error:  # such as text in a header that is not UTF-8
+    except (RuntimeError, ValueError) as error:
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
 
 
@@ -119,10 +120,10 @@ def read_attributes(path: Path) -> dict[str, Any]:
     Raises InputError if it is damaged.
     """
     try:
-        header: dict[str, Any] = OpenEXR.File(checked_name(path), header_only=True).parts[0].header
+        headers, _ = read_headers(checked_name(path))
+        return headers[0]
     except (IndexError, OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: is damaged ({_one_line(str(error))}); render or copy it again") from error
-    return header
 
 
 def first_pixel(path: Path) -> tuple[int, int] | None:
@@ -280,7 +281,9 @@ def _decoded(path: Path) -> tuple[Part, ...]:
         image.close()
     if path.suffix.lower() != ".exr":
         return tuple(parts)
-    headers = [part.header for part in OpenEXR.File(checked_name(path), header_only=True).parts]
+    headers, left_out = read_headers(checked_name(path))
+    for line in left_out:
+        _LOG.warning("%s: %s", path, line)
     return tuple(
         Part(part.channels, {key: value for key, value in header.items() if key not in _ENCODING}, part.name)
         for part, header in zip(parts, headers, strict=True)
