@@ -238,6 +238,25 @@ def test_parts_pass_through(tmp_path: Path) -> None:
         write_denoised(tmp_path / "out.exr", result_for(again, error=True), again)
 
 
+@pytest.mark.parametrize("name", ["cafe.id", "cafe"])
+def test_names_that_are_no_utf8_are_renamed_and_told(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rgb, other = {channel: noise((2, 3), index) for index, channel in enumerate("RGB")}, noise((2, 3), 3)
+    in_layer = "." in name
+    parts = {"": {**rgb, name: other}} if in_layer else {"rgba": rgb, name: {"id": other}}
+    save(tmp_path / "in.exr", parts)
+    content = (tmp_path / "in.exr").read_bytes()
+    (tmp_path / "in.exr").write_bytes(content.replace(b"cafe", b"caf\xe9"))
+    buffers = read_buffers(tmp_path / "in.exr")
+    renamed = name.replace("cafe", r"caf\xe9")
+    assert f"in.exr: expected names in UTF-8: renamed {renamed}" in caplog.text
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    written = load(tmp_path / "out.exr")
+    channels = written[0][1] if in_layer else {part: channels["id"] for part, channels, _ in written[2:]}
+    assert same_bits(channels[renamed], other)
+
+
 def test_no_channel_of_the_noisy_picture_stays_beside_the_denoised_one(tmp_path: Path) -> None:
     for names in ("rgba", "Y", "RGBA"):
         save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})

@@ -12,7 +12,7 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -24,7 +24,7 @@ import OpenEXR
 import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import check_suffix, is_utf8, replacing
-from tungsten_dip.buffers.exr_header import read_headers
+from tungsten_dip.buffers.exr_header import escaped, read_headers
 from tungsten_dip.buffers.render_buffers import FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
@@ -315,6 +315,7 @@ def _part(path: Path, image: Any, index: int) -> Part:
         )
     if suffix == ".pfm":
         _check_pfm(path)
+    part_name, *names = _utf8_names(path, [spec.getattribute("oiio:subimagename") or "", *spec.channelnames])
     channels: dict[str, Channel] = {}
     begin = 0
     while begin < spec.nchannels:
@@ -328,9 +329,18 @@ def _part(path: Path, image: Any, index: int) -> Part:
         if path.suffix.lower() == ".hdr":
             pixels = pixels / _radiance_scale(path)
         planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
-        channels.update(zip(spec.channelnames[begin:end], planes, strict=True))
+        channels.update(zip(names[begin:end], planes, strict=True))
         begin = end
-    return Part(channels, name=spec.getattribute("oiio:subimagename") or "")
+    return Part(channels, name=part_name)
+
+
+def _utf8_names(path: Path, names: Sequence[str]) -> list[str]:
+    """Return names with bytes escaped that are not UTF-8: no file can be written with them."""
+    utf8 = [escaped(name.encode(errors="surrogateescape")) for name in names]
+    renamed = [new for new, old in zip(utf8, names, strict=True) if new != old]
+    if renamed:
+        _LOG.warning("%s: expected names in UTF-8: renamed %s", path, ", ".join(renamed))
+    return utf8
 
 
 def _check_pfm(path: Path) -> None:
