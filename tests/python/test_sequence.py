@@ -9,10 +9,11 @@ import pytest
 
 from conftest import relmse
 from moving_camera import HEIGHT, WIDTH, true_frame
-from tungsten_dip.buffers.image_file import write_exr
+from tungsten_dip.buffers.image_file import write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
+from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.network import blend_network, training
 from tungsten_dip.fit.pilots.presets import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
@@ -77,6 +78,28 @@ def test_a_glob_is_numbered_by_the_last_digits(folders):
     frames = find_frames(f"{folders}/shot2_*.exr", "f####.exr")
     assert [frame.number for frame in frames] == [5, 7]
     assert [f.input.name for f in find_frames(f"{folders}/s*", "f#.exr", (7,))] == ["shot2_f0007.exr"]
+
+
+@pytest.mark.parametrize("outputs", ["f####.exr", "f#_v2.exr", "../{}/f%d.exr"])
+def test_results_that_a_glob_matches_are_no_frames(tmp_path, fitted, frame, outputs):
+    for number in (0, 1, 2):
+        (tmp_path / f"f{number:04d}").mkdir()
+    outputs = f"{tmp_path}/{outputs.format(tmp_path.name)}"
+    frames = find_frames(f"{tmp_path}/f*", outputs)
+    for each in frames[:2]:
+        write_denoised(each.output, fitted, frame.buffers)
+    assert find_frames(f"{tmp_path}/f*", outputs) == frames
+
+
+def test_inputs_that_are_named_like_results_are_frames(tmp_path, fitted, frame):
+    for number in (1, 9, 10):
+        write_denoised(tmp_path / f"f{number}.exr", fitted, frame.buffers)
+    frames = find_frames(f"{tmp_path}/f*.exr", f"{tmp_path}/f##.exr")
+    assert [each.input.name for each in frames] == ["f1.exr", "f9.exr", "f10.exr"]
+    write_denoised(tmp_path / "f01_again.exr", fitted, frame.buffers)
+    write_image(tmp_path / "f1.exr", frame.reference)
+    with pytest.raises(InputError, match=r"f01_again\.exr and .*f1\.exr: both are frame 1"):
+        find_frames(f"{tmp_path}/f*.exr", f"{tmp_path}/f#.exr")
 
 
 def test_brackets_in_a_pattern_with_numbers_are_plain(tmp_path):

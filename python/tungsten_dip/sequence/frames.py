@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from tungsten_dip.buffers.image_file import read_attributes
+from tungsten_dip.buffers.source import ADDED
 from tungsten_dip.errors import InputError
 
 _NUMBER = re.compile(r"##+|%0?(\d+)d")
@@ -65,9 +67,10 @@ def find_frames(
     """Return the frames in the order of their numbers.
 
     ``inputs`` has a place for the number (``####``, ``%04d``) or is a glob pattern, whose files are numbered
-    by the last digits of their names. ``outputs`` has a place for the number, and so has ``scenes``, unless
-    the camera stands still. Of ``numbers``, every one is a frame, whether its files exist or not; None means
-    what is there. They are a step apart, that of the two closest ones: of 1, 3, 5, 9 one is missing.
+    by the last digits of their names; results of these frames that it matches as well are left out.
+    ``outputs`` has a place for the number, and so has ``scenes``, unless the camera stands still. Of
+    ``numbers``, every one is a frame, whether its files exist or not; None means what is there. They are a
+    step apart, that of the two closest ones: of 1, 3, 5, 9 one is missing.
 
     Raises InputError if a pattern has no place for a number, or nothing matches it.
     """
@@ -78,7 +81,7 @@ def find_frames(
         if numbers is None:
             present = _numbered(inputs)
     else:
-        present = _globbed(inputs)
+        present = _globbed(inputs, outputs)
         if numbers is not None:
             missing = Path(inputs)
             present = {number: present.get(number, missing) for number in numbers}
@@ -125,13 +128,22 @@ def _between(places: re.Pattern[str], pattern: str) -> list[str]:
     return [pattern[first:end] for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
-def _globbed(pattern: str) -> dict[int, Path]:
+def _globbed(pattern: str, outputs: str) -> dict[int, Path]:
     if not glob.has_magic(pattern):
         raise InputError(
             f"{pattern}: expected a place for the frame's number, such as f####, f%04d or f*; or use denoise"
         )
+    paths = _glob(pattern)
+    outputs_there = {path.resolve(): number for number, path in _numbered(outputs).items()}
+    results = {
+        path: number
+        for path in paths
+        if (number := outputs_there.get(path.resolve())) is not None and _is_denoised(path)
+    }
     found: dict[int, Path] = {}
-    for path in _glob(pattern):
+    for path in sorted(paths, key=results.__contains__):
+        if results.get(path) in found:
+            continue
         digits = re.findall(r"\d+", path.stem if path.is_file() else path.name)
         if not digits:
             raise InputError(f"{path}: expected a frame's number in its name; use a narrower pattern")
@@ -140,6 +152,13 @@ def _globbed(pattern: str) -> dict[int, Path]:
             raise InputError(f"{found[number]} and {path}: both are frame {number}; use a narrower pattern")
         found[number] = path
     return found
+
+
+def _is_denoised(path: Path) -> bool:
+    try:
+        return ADDED in read_attributes(path)
+    except InputError:  # any other file that is named like a result
+        return False
 
 
 def _glob(pattern: str) -> list[Path]:
