@@ -102,6 +102,15 @@ def test_a_single_file_is_a_set_too(folder, bench_set):
     assert single.buffers.albedo is None
 
 
+def test_the_map_chooses_the_layers_of_the_sets(folder, fits, tmp_path, capfd):
+    options = ["-o", str(tmp_path / "out"), "--methods", "presets", "--presets", "draft", "--map"]
+    refused(capfd, ["bench", "pareto", str(folder), *options, "albedo=gone"], "--map albedo=gone: not in")
+    refused(capfd, ["bench", "paper", str(folder), "--map", "albedo=gone"], "--map albedo=gone: not in")
+    (without,) = read_sets([str(folder)], {"albedo": "none"})
+    assert without.buffers.albedo is None
+    assert without.digest != read_sets([str(folder)])[0].digest
+
+
 def test_sets_that_cannot_be_told_apart_are_refused(folder):
     with pytest.raises(InputError, match="two sets"):
         read_sets([str(folder), str(folder)])

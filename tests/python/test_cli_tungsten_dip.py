@@ -200,6 +200,13 @@ def test_inspect_buffers(folder, capfd):
     assert "visibility" not in facts["quantities"]
 
 
+def test_inspect_takes_the_map(folder, scene, capfd):
+    assert command.main(["inspect", str(folder), "--map", "depth=none", "--json"]) == 0
+    assert "depth" not in json.loads(capfd.readouterr().out)["quantities"]
+    assert command.main(["inspect", str(scene), "--map", "depth=none"]) == 2
+    assert "a scene names its buffers itself; use --map with a folder or an image" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

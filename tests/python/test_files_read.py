@@ -809,6 +809,21 @@ def test_sizes_must_agree(tmp_path: Path) -> None:
     refused(tmp_path / "p.exr", "expected 7 x 5")
 
 
+def test_where_the_map_chooses_no_layers_the_advice_is_another(tmp_path: Path) -> None:
+    save(tmp_path / "depth.exr", *"RGB")
+    save(tmp_path / "color.exr", *"RGB")
+    with pytest.raises(InputError, match=r"depth: expected 1 channels, .*; save its file with what is exp"):
+        read_buffers(tmp_path)
+    save(tmp_path / "a.exr", *"RGB", *rgb("depth"))
+    refused(tmp_path / "a.exr", r"depth: expected 1 channels, .*; choose with --map depth=CHANNEL\Z")
+    assert read_buffers(tmp_path / "a.exr", {"depth": "depth.R"}).depth is not None
+    save(tmp_path / "color.exr", "id", "mask")
+    with pytest.raises(InputError, match=r"no colour: expected R, G, B or .*; save its file with what is ex"):
+        read_buffers(tmp_path)
+    save(tmp_path / "a.exr", *"RG")
+    refused(tmp_path / "a.exr", r"no colour: .*; use --map color=LAYER\Z")
+
+
 def test_without_colour(tmp_path: Path) -> None:
     save(tmp_path / "a.exr", *rgb("albedo"), "Z")
     refused(tmp_path / "a.exr", "no colour.*found Z, albedo; use --map color=LAYER")

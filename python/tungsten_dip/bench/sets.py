@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,16 +36,16 @@ class BenchSet:
     digest: str
 
 
-def read_sets(texts: Sequence[str]) -> list[BenchSet]:
+def read_sets(texts: Sequence[str], mapping: Mapping[str, str] | None = None) -> list[BenchSet]:
     """Read every ``INPUT`` or ``INPUT=REFERENCE``.
 
-    ``INPUT`` is whatever `read_buffers` takes. Where no reference is named, it is the file ``reference.exr``
-    in the folder of the buffers or the folder above.
+    ``INPUT`` is whatever `read_buffers` takes, with the same ``mapping`` for all. Where no reference is
+    named, it is the file ``reference.exr`` in the folder of the buffers or the folder above.
 
     Raises InputError if a file cannot be read, there is no reference, its size or that of NFOR's image is
     another one, or two sets have one name.
     """
-    sets = [_read_set(text) for text in texts]
+    sets = [_read_set(text, mapping) for text in texts]
     names = [each.name for each in sets]
     for name in names:
         if names.count(name) > 1:
@@ -86,9 +86,9 @@ def cropped(buffers: RenderBuffers, part: tuple[slice, slice]) -> RenderBuffers:
     return RenderBuffers(**quantities, spp=spp, alpha=alpha)
 
 
-def _read_set(text: str) -> BenchSet:
+def _read_set(text: str, mapping: Mapping[str, str] | None) -> BenchSet:
     path, reference_path = _paths(text)
-    buffers, reference = read_buffers(path), read_image(reference_path)
+    buffers, reference = read_buffers(path, mapping), read_image(reference_path)
     _check_size(reference_path, reference, path, buffers)
     if not np.isfinite(reference).all():
         raise InputError(f"{reference_path}: expected a finite reference, got NaN or Inf; render it again")

@@ -45,6 +45,9 @@ _CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix 
     "spp": 1,
 }
 
+_OTHER_FILE = "save its file with what is expected"
+"""What to do about the layers of a file whose layers --map does not choose."""
+
 
 def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> RenderBuffers:
     """Read what a renderer saved and log which layer was taken for which quantity.
@@ -224,7 +227,8 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
     try:
         owner, found = _find_layers(source)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        reason = str(error) if _maps_layers(path) else f"{str(error).partition('; ')[0]}; {_OTHER_FILE}"
+        raise InputError(f"{path}: {reason}") from None
     groups = dict(found.channels)
     main, _ = owner[groups["color"][0]]
     color_part = next(index for index, part in enumerate(source.parts) if part is main)
@@ -326,7 +330,13 @@ def _with_channel_count(image: FloatImage, path: Path, key: str, names: tuple[st
         return np.ascontiguousarray(image[..., :1])
     if count == 3 and given == 1 and not key.startswith("normal"):
         return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
-    raise InputError(f"{path}: {key}: expected {count} channels, found {', '.join(names)}; choose with --map")
+    remedy = f"choose with --map {key}=CHANNEL" if _maps_layers(path) else _OTHER_FILE
+    raise InputError(f"{path}: {key}: expected {count} channels, found {', '.join(names)}; {remedy}")
+
+
+def _maps_layers(path: Path) -> bool:
+    """Whether --map chooses layers of an input: of a folder it chooses files, a scene takes none."""
+    return path.suffix.lower() != ".json" and not is_folder(path)
 
 
 def _settle_variance(

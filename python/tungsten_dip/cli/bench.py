@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.cli.console import add_json, add_threads, duration, integers, progress_on_stderr
+from tungsten_dip.cli.denoising import add_map, layer_mapping
 from tungsten_dip.fit.paper.constants import ITERATIONS
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ def _add_common(parser: argparse.ArgumentParser, folder: str, one: bool = False)
         default=Path(folder),
         help=f"where results are, and a run goes on (default: {folder})",
     )
+    add_map(parser)
     add_threads(parser)
     add_json(parser)
 
@@ -108,7 +110,7 @@ def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         "threads": options.threads,
     }
     plan = Plan(**{name: value for name, value in given.items() if value is not None})
-    sets = read_sets(options.sets)
+    sets = read_sets(options.sets, layer_mapping(options))
     with progress_on_stderr("measuring") as progress:
         found = run_pareto(sets, plan, options.output, progress)
     facts = {
@@ -123,7 +125,7 @@ def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from tungsten_dip.bench.paper_table import SCENES, run_paper_table
     from tungsten_dip.bench.sets import cropped_as_published, read_sets
 
-    (bench_set,) = read_sets(options.sets)
+    (bench_set,) = read_sets(options.sets, layer_mapping(options))
     if options.crop:
         bench_set = cropped_as_published(bench_set)
     with progress_on_stderr("fitting") as progress:

@@ -66,9 +66,15 @@ def _above_zero(text: str, value: float) -> float:
 
 def add_file_options(parser: argparse._ActionsContainer) -> None:
     """Add how buffers are read and their results are written."""
-    add = parser.add_argument
-    add("--map", metavar="NAME=CHANNEL", type=_name_and_channel, action="append", default=[], help=MAP_HELP)
-    add("--half", dest="float16", action="store_true", help="write 16-bit floats")
+    add_map(parser)
+    parser.add_argument("--half", dest="float16", action="store_true", help="write 16-bit floats")
+
+
+def add_map(parser: argparse._ActionsContainer) -> None:
+    """Add how buffers are read (`layer_mapping`)."""
+    parser.add_argument(
+        "--map", metavar="NAME=CHANNEL", type=_name_and_channel, action="append", default=[], help=MAP_HELP
+    )
 
 
 def layer_mapping(options: argparse.Namespace) -> dict[str, str]:

@@ -34,6 +34,7 @@ from tungsten_dip.cli.denoising import (
     REPORT_HELP,
     add_file_options,
     add_fit_options,
+    add_map,
     check_no_input,
     denoise_with_progress,
     fit_settings,
@@ -120,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     inspect = commands.add_parser("inspect", help="show what a scene calls for, or what a file holds")
     inspect.set_defaults(action=_inspect)
     inspect.add_argument("input", metavar="SCENE|INPUT", type=Path, help=f"a scene, or {INPUT_HELP}")
+    add_map(inspect)
 
     compare = commands.add_parser("compare", help="measure an image against its reference")
     compare.set_defaults(action=_compare)
@@ -229,10 +231,11 @@ def _denoised(
 
 
 def _inspect(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    if options.input.suffix.lower() == ".json":
+    mapping = layer_mapping(options)
+    if options.input.suffix.lower() == ".json" and not mapping:
         scene = load_scene(options.input)
         return inspect_facts(scene), inspect_text(scene)
-    return _facts_of_buffers(read_buffers(options.input))
+    return _facts_of_buffers(read_buffers(options.input, mapping))
 
 
 def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
