@@ -253,6 +253,24 @@ def test_of_several_views_the_one_that_is_denoised_is_told(
     assert not caplog.text
 
 
+def test_of_several_view_layers_the_one_that_is_denoised_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    layers = [f"{view}.{layer}" for view in ("Back", "Fore") for layer in ("Combined", "DiffCol")]
+    channels = save(tmp_path / "a.exr", *(name for layer in layers for name in rgb(layer)))
+    read_buffers(tmp_path / "a.exr")
+    assert "view layers Back, Fore: only Back.Combined.RGB is denoised; choose others with" in caplog.text
+    caplog.clear()
+    fore = read_buffers(tmp_path / "a.exr", {"color": "Fore.Combined"})
+    assert holds(fore.color, channels, *rgb("Fore.Combined"))
+    assert holds(fore.albedo, channels, *rgb("Fore.DiffCol"))
+    save(tmp_path / "one.exr", *rgb("Back.Combined"), *rgb("Back.Noisy Image"), *rgb("Composite.Combined"))
+    read_buffers(tmp_path / "one.exr")
+    save(tmp_path / "top.exr", *"RGB", *rgb("key.beauty"), *rgb("fill.beauty"))
+    read_buffers(tmp_path / "top.exr")
+    assert not caplog.text
+
+
 def test_variance_of_unknown_scale_is_taken_only_when_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

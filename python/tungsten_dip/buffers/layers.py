@@ -133,6 +133,20 @@ def denoised_layer(channel_names: Iterable[str]) -> str | None:
     return shown[0] if len(shown) == 1 else None
 
 
+def view_layers(color: Iterable[str], channel_names: Iterable[str]) -> list[str]:
+    """Return the view layers that hold a picture, if the channels of the colour are those of one of them.
+
+    Blender names its layers ``VIEW LAYER.Combined``.
+    """
+    pictures: dict[str, set[str]] = {}
+    for layer, components in _layers(list(channel_names)).items():
+        before, _, last = layer.rpartition(".")
+        is_result = f"{before}.".lower() == _COMPOSITE
+        if before and not is_result and last.lower() in ALIASES["color"] and len(_ordered(components)) == 3:
+            pictures.setdefault(before, set()).update(components.values())
+    return list(pictures) if any(not channels.isdisjoint(color) for channels in pictures.values()) else []
+
+
 def check_no_chroma(color: Iterable[str], channel_names: Iterable[str]) -> None:
     """Raise InputError if the channels of the colour are luminance, and others of the file its chroma."""
     if "Y" in map(str.upper, color) and {"RY", "BY"} <= set(channel_names):

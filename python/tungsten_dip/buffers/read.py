@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from tungsten_dip.buffers.layers import (
     find_layers,
     mapped_channels,
     names_quantity,
+    view_layers,
 )
 from tungsten_dip.buffers.render_buffers import (
     CHANNELS,
@@ -254,20 +255,35 @@ def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> R
         _LOG.info("alpha: %s", groups["alpha"][0])
     if found.ignored:
         _LOG.info("ignored: %s", ", ".join(found.ignored))
-    views = _views(source.parts)
-    if len(views) > 1 and "color" not in source.mapping:
-        _LOG.warning(
-            "%s: views %s: only %s is denoised, with features that are found by name; choose the layers of "
-            "one view with --map, for each view in turn",
-            path,
-            ", ".join(views),
-            _shown(groups["color"]),
-        )
+    if "color" not in source.mapping:
+        _warn_of_other_views(path, groups["color"], source.parts, owner)
     return RenderBuffers(
         **buffers,
         attributes={k: v for k, v in attributes.items() if k not in FRAME and not k.startswith(OWN)},
         source=replace(source, color_part=color_part, read=buffers),
     )
+
+
+def _warn_of_other_views(
+    path: Path, color: tuple[str, ...], parts: Sequence[Part], channel_names: Iterable[str]
+) -> None:
+    """Warn where a file holds several pictures, of which one is the colour."""
+    views, several = _views(parts), view_layers(color, channel_names)
+    if len(views) > 1:
+        _LOG.warning(
+            "%s: views %s: only %s is denoised, with features that are found by name; choose the layers of "
+            "one view with --map, for each view in turn",
+            path,
+            ", ".join(views),
+            _shown(color),
+        )
+    elif len(several) > 1:
+        _LOG.warning(
+            "%s: view layers %s: only %s is denoised; choose others with --map color=LAYER, each in turn",
+            path,
+            ", ".join(several),
+            _shown(color),
+        )
 
 
 def _views(parts: Sequence[Part]) -> list[str]:
