@@ -147,6 +147,35 @@ def test_the_plane_that_was_mended_is_named(plane: str, told: str, render: Synth
     assert lines == (f"repaired {told} 1 NaN",)
 
 
+@pytest.mark.parametrize("sky", [0, np.nan, np.inf, -np.inf, 1e10, -1e10])
+def test_a_depth_that_is_negative_everywhere_changes_its_sign(sky: float, render: SyntheticRender) -> None:
+    depth = render.buffers.depth
+    assert depth is not None
+    assert depth.halves is not None
+    ahead = [np.where(depth.mean > 0.1, array, 0) for array in (depth.mean, *depth.halves)]
+    behind = Buffer(*(np.where(array == 0, np.float32(sky), -array) for array in ahead), depth.variance)
+    before = _frozen_bytes(buffers := render.buffers.with_quantities(depth=behind))
+    mended, lines = sanitize(buffers)
+    assert lines[0] == "changed the sign of the depth, which was negative everywhere"
+    assert len(lines) == (2 if sky else 1)
+    expected, _ = sanitize(render.buffers.with_quantities(depth=Buffer(*ahead, depth.variance)))
+    assert mended.depth is not None
+    assert expected.depth is not None
+    if not np.isnan(sky):  # which is rebuilt from the depth around
+        for (_, new), (_, true) in zip(mended.depth.planes(), expected.depth.planes(), strict=True):
+            np.testing.assert_array_equal(new, true)
+    assert _frozen_bytes(buffers) == before
+
+
+def test_a_depth_of_both_signs_is_mended_where_it_is_negative() -> None:
+    color = np.ones((2, 3, 3), np.float32)
+    depth = np.array([[-1, -2, 0], [-3, np.nan, 4]], np.float32)[..., None]
+    mended, lines = sanitize(RenderBuffers(Buffer(color), depth=Buffer(depth)))
+    assert lines == ("repaired depth 1 NaN, 3 negative",)
+    assert mended.depth is not None
+    assert (mended.depth.mean >= 0).all()
+
+
 def test_what_negative_lobes_lack_comes_from_the_light_around(render: SyntheticRender) -> None:
     def sharpened(image: FloatImage) -> FloatImage:
         return np.asarray(1.4 * image - 0.2 * (np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
@@ -12,15 +14,19 @@ _PLANES = ("", " half A", " half B", " variance")
 def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Repair NaN, infinite and negative values; return buffers and a log line per repaired quantity.
 
-    No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative), and so does an
-    infinite depth (1e9 and more), which marks the sky. The energy of a filter's negative lobes is taken from
-    the radiance around, so that the mean is preserved. Everything else, also normals of 1e6 and an albedo of
-    1e12 and more, is rebuilt: the mean and the halves from one another, a variance from the halves, and what
-    remains from the valid pixels around it or, far from any, from the half that is valid. Arrays without
-    defects are shared with ``buffers``, which are not modified. ``threads`` None uses every core.
+    No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative; a depth that is
+    negative everywhere changes its sign), and so does an infinite depth (1e9 and more), which marks the sky.
+    The energy of a filter's negative lobes is taken from the radiance around, so that the mean is preserved.
+    Everything else, also normals of 1e6 and an albedo of 1e12 and more, is rebuilt: the mean and the halves
+    from one another, a variance from the halves, and what remains from the valid pixels around it or, far
+    from any, from the half that is valid. Arrays without defects are shared with ``buffers``, which are not
+    modified. ``threads`` None uses every core.
     """
     repaired: dict[str, Buffer | None] = {}
     lines = []
+    if buffers.depth is not None and (depth := with_depth_ahead(buffers.depth)) is not buffers.depth:
+        buffers = buffers.with_quantities(depth=depth)
+        lines.append("changed the sign of the depth, which was negative everywhere")
     for quantity, buffer in buffers.quantities():
         planes, defects = _core.sanitize(
             quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, thread_count(threads)
@@ -34,6 +40,18 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
             repaired[quantity] = Buffer(*planes)
             lines.append(f"repaired {'; '.join(found)}")
     return buffers.with_quantities(**repaired), tuple(lines)
+
+
+def with_depth_ahead(depth: Buffer) -> Buffer:
+    """Return a depth with the opposite sign if it is negative wherever something is seen, else as it is.
+
+    It is then a coordinate in the space of a camera that looks along the negative axis.
+    """
+    known = depth.mean[(np.abs(depth.mean) < _core.INFINITE_DEPTH) & (depth.mean != 0)]
+    if known.size == 0 or not (known < 0).all():
+        return depth
+    ahead = {name: plane if name == "variance" else -plane for name, plane in depth.planes()}
+    return Buffer(**ahead)
 
 
 def _counts(defects: _core.Defects) -> str:

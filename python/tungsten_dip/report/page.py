@@ -11,6 +11,7 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip.buffers.display import ldr_from_feature, ldr_from_radiance
 from tungsten_dip.buffers.render_buffers import FEATURES, RenderBuffers
+from tungsten_dip.buffers.sanitize import with_depth_ahead
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import PAPER_SETTINGS
 from tungsten_dip.report import html
@@ -62,9 +63,9 @@ def _features(buffers: RenderBuffers) -> Iterator[Picture]:
     The depth of the sky, which other renderers mark by a large number, is 0 as in Tungsten's.
     """
     for name, buffer in buffers.quantities():
-        values = np.nan_to_num(buffer.mean)
         if name == "color":
             continue
+        values = np.nan_to_num((with_depth_ahead(buffer) if name == "depth" else buffer).mean)
         if name == "depth":
             values = np.where(values < _core.INFINITE_DEPTH, values, np.float32(0))
             values = np.minimum(values, np.float32(np.percentile(values, 99) or np.inf))
