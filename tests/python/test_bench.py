@@ -6,6 +6,7 @@ import re
 import shlex
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -185,6 +186,20 @@ def measurement(repeat=0, method="draft", seconds=1.5, relmse=0.01):
     key = Key("room/n16", method, "preset=draft channels=1,2", "0.1", "abc", 'a "CPU", 2 threads', repeat)
     distances = Comparison(float("inf"), relmse, None, 0.1, None, 0, None)
     return Measurement(key=key, seconds=seconds, iterations=7, **asdict(distances))
+
+
+def test_runs_at_once_keep_the_measurements_of_each_other(tmp_path):
+    path = tmp_path / "results.csv"
+    runs = [Results(path) for _ in range(4)]
+
+    def measure(run):
+        for repeat in range(5):
+            runs[run].add([measurement(repeat, method=f"method {run}")])
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(measure, range(len(runs))))
+    with path.open() as stream:
+        assert len(list(csv.DictReader(stream))) == 20
 
 
 def test_measurements_survive_their_file(tmp_path):

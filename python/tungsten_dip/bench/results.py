@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import fcntl
+import os
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -62,15 +65,24 @@ class Results:
         """
         self._path = path
         self._by_key: dict[Key, Measurement] = {}
-        if path.exists():
-            self._by_key = {row.key: row for row in _read(path)}
+        self._add_those_of_the_file()
 
     def __contains__(self, key: Key) -> bool:
         return key in self._by_key
 
     def add(self, measurements: Iterable[Measurement]) -> None:
-        """Add rows and rewrite the file, whole or not at all."""
-        self._by_key |= {row.key: row for row in measurements}
+        """Add rows and rewrite the file, whole or not at all, with the rows that others have added."""
+        added = {row.key: row for row in measurements}
+        with _locked(self._path.parent):
+            self._add_those_of_the_file()
+            self._by_key |= added
+            self._write()
+
+    def _add_those_of_the_file(self) -> None:
+        if self._path.exists():
+            self._by_key |= {row.key: row for row in _read(self._path)}
+
+    def _write(self) -> None:
         with replacing(self._path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
             writer.writeheader()
@@ -85,6 +97,18 @@ class Results:
         return Measurement(
             key=keys[0], **{name: _median([getattr(row, name) for row in rows]) for name in VALUES}
         )
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Let one process at a time change a folder's measurements."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # of a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _median(values: Sequence[Any]) -> Any:
