@@ -23,6 +23,8 @@ FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 
 MAP_HELP = "take this layer of the input for color, albedo, normal, depth, colorA, ..."
 
+_TARGET_ERROR_HELP = "end at this relMSE (epsilon 0.01, in the image's own units)"
+
 REPORT_HELP = "write a page with the pictures, the error and what led to them"
 
 
@@ -41,7 +43,7 @@ def add_fit_options(
         help="another denoiser, whose image is an extra pilot (default: none)",
     )
     add(f"{flag}time-budget", dest="time_budget_s", metavar="S", type=_budget, help="end after 90s, 5m, ...")
-    add(f"{flag}target-error", dest="target_error", metavar="E", type=_error, help="end at this relMSE")
+    add(f"{flag}target-error", dest="target_error", metavar="E", type=_error, help=_TARGET_ERROR_HELP)
     add(f"{flag}device", dest="device", choices=devices, help="where to fit (default: auto)")
     add(f"{flag}save-model", dest="save_model", metavar="M.onnx", type=Path, help="save the fitted network")
     add(f"{flag}warm-start", dest="warm_start", metavar="M.onnx", type=Path, help="start from this network")
