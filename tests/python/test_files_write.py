@@ -344,6 +344,23 @@ def test_the_map_is_remembered(tmp_path: Path) -> None:
     assert_same(buffers, read_buffers(tmp_path / "out.exr"))
     other = read_buffers(tmp_path / "out.exr", {"color": "R,G,B"})
     assert same_bits(other.color.mean, read_buffers(tmp_path / "in.exr").color.mean)
+    assert same_bits(other.normal.mean, buffers.normal.mean)
+
+
+def test_what_the_map_gives_for_a_mean_replaces_what_is_remembered_of_it(tmp_path: Path) -> None:
+    names = [*"RGB", *(f"{layer}.{c}" for layer in ("a", "first", "second") for c in "RGB"), "nx", "ny", "nz"]
+    save(tmp_path / "in.exr", {"": {name: noise((3, 2), index) for index, name in enumerate(names)}})
+    mapping = {"albedo": "a", "albedoA": "first", "albedoB": "second", "normal": "nx,ny,nz"}
+    buffers = read_buffers(tmp_path / "in.exr", mapping)
+    assert buffers.albedo.halves is not None
+    write_denoised(tmp_path / "out.exr", result_for(buffers), buffers)
+    without = read_buffers(tmp_path / "out.exr", {"albedo": "none"})
+    assert without.albedo is None
+    assert same_bits(without.normal.mean, buffers.normal.mean)
+    one_half = read_buffers(tmp_path / "out.exr", {"albedoA": "none"}).albedo
+    assert same_bits(one_half.mean, buffers.albedo.mean)
+    assert one_half.half_a is None
+    assert same_bits(one_half.half_b, buffers.albedo.half_b)
 
 
 @pytest.mark.parametrize("kept", [["R", "G", "B"], ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B"]])

@@ -58,7 +58,8 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
     multi-layer or multi-part EXR. ``mapping`` settles what its names leave open: ``{"color": "beauty"}``.
     Its keys are the quantities and ``alpha``, quantities also with ``A``, ``B`` (halves) and ``Variance``
     (of the mean). A value is a layer, a channel, channels joined by commas, for a folder a file name, or
-    ``none``. Values of pixels are not changed: nothing is sanitised.
+    ``none``. What was given for the input of a denoised file still holds for what it leaves open. Values of
+    pixels are not changed: nothing is sanitised.
 
     Raises InputError if a file is missing, damaged or no image, if sizes differ, or if there is no colour.
     """
@@ -74,7 +75,10 @@ def read_buffers(path: str | Path, mapping: Mapping[str, str] | None = None) -> 
             raise InputError(f"{path}: a scene names its buffers itself; use --map with a folder or an image")
         return _from_images(path, *files_of_scene(path), {})
     source, attributes = _unwrapped(path, read_parts(path))
-    return _from_source(path, replace(source, mapping=mapping or source.mapping), attributes)
+    # Halves and variance that were given for one mean are not those of another.
+    means = tuple(key for key in mapping if key in CHANNELS)
+    remembered = {key: value for key, value in source.mapping.items() if not key.startswith(means)}
+    return _from_source(path, replace(source, mapping=remembered | mapping), attributes)
 
 
 def _check_mapping(mapping: Any) -> None:
