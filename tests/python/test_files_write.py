@@ -626,6 +626,17 @@ def test_single_pictures(tmp_path: Path, size: tuple[int, int], count: int, suff
     assert np.abs(stored - image).max() <= tolerance
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64])
+def test_integers_are_no_values_from_0_to_1(tmp_path: Path, dtype: type) -> None:
+    image = np.arange(18).reshape(2, 3, 3).astype(dtype)
+    with pytest.raises(InputError, match=rf"expected values from 0 to 1, got {dtype.__name__}; divide by"):
+        write_image(tmp_path / "a.png", image)
+    write_image(tmp_path / "a.png", image > 8)
+    np.testing.assert_array_equal(oiio.ImageBuf(str(tmp_path / "a.png")).get_pixels() == 1, image > 8)
+    write_image(tmp_path / "a.exr", image)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), image)
+
+
 def test_png_clips_and_rounds(tmp_path: Path) -> None:
     values = np.array([-1, 0, 0.499 / 255, 0.501 / 255, 1, 7], np.float32)
     write_image(tmp_path / "a.png", values.reshape(1, 6, 1))

@@ -200,8 +200,8 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
 
     .exr and .pfm take linear radiance as float32, .hdr as RGBE; .png takes display-referred values in [0, 1]
     (clipped, 8 bit). Raises InputError if the suffix or the shape is another one, if these are no numbers
-    or too large ones for float32, if they are not all from 0 to MOST_HDR for a .hdr, or if the file cannot be
-    written.
+    or too large ones for float32, if they are integers for a .png or not all from 0 to MOST_HDR for a .hdr,
+    or if the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -211,6 +211,10 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         raise InputError(
             f"{path}: expected a picture of shape (height, width, 1 or 3), got {image.shape}; reshape it, or "
             f"choose channels"
+        )
+    if suffix == ".png" and image.dtype.kind in "iu":
+        raise InputError(
+            f"{path}: expected values from 0 to 1, got {image.dtype}; divide by 255 (of 16 bits, by 65535)"
         )
     image = as_float32(str(path), image)
     if suffix == ".exr":
