@@ -319,6 +319,8 @@ def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) ->
         )
     with pytest.raises(InputError, match="buffers: expected RenderBuffers, got NoneType; give those"):
         write_denoised(tmp_path / "out.exr", result_for(buffers), None)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="result: expected Denoised, got ndarray; give what denoise"):
+        write_denoised(tmp_path / "out.exr", result_for(buffers).color, buffers)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"ends in \.exr"):
         write_denoised(tmp_path / "out.png", result_for(buffers), buffers)
     assert not list(tmp_path.glob("out*"))

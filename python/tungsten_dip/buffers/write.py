@@ -19,7 +19,7 @@ import logging
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -43,6 +43,7 @@ _GREY = ("Y",)
 _COMPONENTS = {"color": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Y", "visibility": "Y"}
 
 
+@runtime_checkable
 class Denoised(Protocol):
     """The part of the result of a fit that is saved."""
 
@@ -78,11 +79,12 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
     or too small for that. Settings, seed, seconds, iterations, the estimated relMSE and the version become
     attributes.
 
-    Raises InputError if the file is no .exr or cannot be written, or the result is of another size than the
-    buffers or no numbers; an existing file then stays as it was.
+    Raises InputError if the file is no .exr or cannot be written, or the result is none, of another size than
+    the buffers, or no numbers; an existing file then stays as it was.
     """
     path = Path(path)
     check_suffix(path, ".exr")
+    check_type("result", result, Denoised, "give what denoise returned, not its image alone")
     check_type("buffers", buffers, RenderBuffers, "give those that the result was made from")
     color = _of_result("color", result.color, buffers, 3)
     source = buffers.source or _source_from_buffers(buffers)
