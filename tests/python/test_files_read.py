@@ -993,6 +993,11 @@ def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> No
         read_image(tmp_path / f"a{suffix}")
 
 
+def test_pictures_of_other_formats_are_to_be_converted(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").touch()
+    refused(tmp_path / "a.tif", r"expected linear radiance as \.exr, \.pfm, \.hdr; .* oiiotool IN\.tif -o")
+
+
 def test_layers_without_end_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_parts(tmp_path / "p.exr", **{f"layer{i}": {n: pixels(i) for n in "RGB"} for i in range(4)})
     assert len(image_file.read_parts(tmp_path / "p.exr")) == 4

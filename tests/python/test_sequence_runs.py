@@ -300,6 +300,13 @@ def test_bad_options_are_one_line(frames, capsys):
     assert not outputs(frames)
 
 
+def test_a_pattern_that_the_shell_has_expanded_is_to_be_quoted(frames, capsys):
+    inputs = sorted(map(str, Path("noisy").iterdir()))
+    assert main(["sequence", *inputs, "-o", "out/f####.exr"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{inputs[1]}: expected one pattern for all frames, got {COUNT} names; quote it" in line
+
+
 @pytest.mark.parametrize(
     "more",
     [

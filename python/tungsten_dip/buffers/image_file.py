@@ -35,6 +35,9 @@ _LOG = logging.getLogger(__name__)
 RADIANCE_SUFFIXES = (".exr", ".pfm", ".hdr")
 """Formats that hold linear radiance, in the order of preference."""
 
+_CONVERTIBLE_SUFFIXES = (".tif", ".tiff")
+"""Formats that may hold linear radiance, or a picture for display: which, the file does not say."""
+
 MAX_PIXELS = 2**28
 """The largest image read: 16384 x 16384. One channel of it is 1 GiB of float32."""
 
@@ -95,7 +98,10 @@ def read_parts(path: Path) -> tuple[Part, ...]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name")
     if path.suffix.lower() not in RADIANCE_SUFFIXES:
-        raise InputError(f"{path}: holds no linear radiance; expected {', '.join(RADIANCE_SUFFIXES)}")
+        expected = f"{path}: expected linear radiance as {', '.join(RADIANCE_SUFFIXES)}"
+        if path.suffix.lower() in _CONVERTIBLE_SUFFIXES:
+            raise InputError(f"{expected}; if it is linear, use oiiotool IN{path.suffix} -o OUT.exr")
+        raise InputError(f"{expected}; name such a file")
     try:
         return _decoded(path)
     except InputError:

@@ -55,6 +55,7 @@ def add_sequence(commands: _SubParsersAction[Any]) -> None:
     sequence.set_defaults(action=_sequence)
     add = sequence.add_argument
     add("input", metavar="'IN/f####'", help="inputs as for denoise; ####, %%04d or * stands for the number")
+    add("expanded", nargs="*", help=argparse.SUPPRESS)
     add("-o", "--output", metavar="'OUT/f####.exr'", required=True, help="where the results go")
     add("--frames", metavar="1-100,103", help="which frames (default: all that are there)")
     add("--cameras", metavar="'f####.json'", help="the scenes of the frames: lets one frame help the next")
@@ -98,6 +99,11 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
         from tungsten_dip.sequence.frames import find_frames, numbers_from_text
         from tungsten_dip.sequence.work import Run
 
+    if options.expanded:
+        raise InputError(
+            f"{options.expanded[0]}: expected one pattern for all frames, got {1 + len(options.expanded)} "
+            f"names; quote it, so that the shell does not expand it"
+        )
     if options.workers is not None:
         whole_number("--workers", options.workers, 1, MOST_THREADS)
     if options.scheduler != "local" and options.workers is not None:
