@@ -66,6 +66,20 @@ def test_json_is_all_there_is_on_stdout(folder, tmp_path, fits, capfd):
     assert "chatters" in err
 
 
+@pytest.mark.parametrize(("preset", "bytes_per_pixel"), [("draft", 550), ("balanced", 1100), ("final", 1300)])
+def test_too_little_memory_is_told_before_the_fit(
+    folder, tmp_path, fits, capfd, monkeypatch, preset, bytes_per_pixel
+):
+    arguments = ["denoise", str(folder), "-o", str(tmp_path / "out.exr"), "--preset", preset]
+    warning = f"{folder}: there may be too little memory for 56 x 40 pixels"
+    for pixels, told in ((56 * 40, False), (56 * 40 - 1, True)):
+        available = pixels * bytes_per_pixel
+        monkeypatch.setattr("tungsten_dip.hosts.memory._available_bytes", lambda free=available: free)
+        assert command.main(arguments) == 0
+        err = capfd.readouterr().err
+        assert (warning in err) == (f"expected {pixels} at most" in err) == told
+
+
 def test_options_become_settings(folder, tmp_path, fits):
     given = (
         "--preset paper --iterations 12 --time-budget 1.5m --target-error 0.01 --seed 3 --device cpu "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
@@ -16,7 +17,13 @@ from tungsten_dip.fit import denoise
 from tungsten_dip.fit.model import Model, check_settings
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings, Preset
+from tungsten_dip.hosts.memory import pixels_that_fit
 from tungsten_dip.interrupts import deferred_interrupts
+
+_LOG = logging.getLogger(__name__)
+
+_BYTES_PER_PIXEL = {"draft": 550, "balanced": 1100, "final": 1300}
+"""A bit less than a fit takes beside its buffers, as measured with 1 million pixels (balanced: with 8)."""
 
 FIT_OPTIONS = ("preset", "pilot", "time_budget_s", "target_error", "device")
 """The settings that both commands leave to the user."""
@@ -119,6 +126,21 @@ def check_no_input(outputs: Iterable[Path | None], inputs: Collection[Path]) -> 
     for path in outputs:
         if path is not None and path.resolve() in inputs:
             raise InputError(f"{path}: is one of the files that are read; name another file")
+
+
+def warn_of_little_memory(path: Path, buffers: RenderBuffers, preset: Preset) -> None:
+    """Log a warning if a fit may be killed for want of memory, of which the system says nothing."""
+    if preset in _BYTES_PER_PIXEL:
+        most = pixels_that_fit(_BYTES_PER_PIXEL[preset])
+        if buffers.width * buffers.height > most:
+            _LOG.warning(
+                "%s: there may be too little memory for %d x %d pixels, with which the system may end this "
+                "without a word: expected %d at most; free some, crop it or use --preset draft",
+                path,
+                buffers.width,
+                buffers.height,
+                most,
+            )
 
 
 def denoise_with_progress(

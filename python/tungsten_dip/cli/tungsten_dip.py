@@ -40,6 +40,7 @@ from tungsten_dip.cli.denoising import (
     fit_settings,
     layer_mapping,
     load_warm_start,
+    warn_of_little_memory,
     write_model,
 )
 from tungsten_dip.cli.sequence import add_sequence
@@ -157,9 +158,12 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
     settings = fit_settings(options, names, warm_start)
     check_ready(settings, warm_start)
-    return _denoised(
-        options, settings.preset, lambda buffers: denoise_with_progress(buffers, settings, warm_start)
-    )
+
+    def fit(buffers: RenderBuffers) -> FitResult:
+        warn_of_little_memory(options.input, buffers, settings.preset)
+        return denoise_with_progress(buffers, settings, warm_start)
+
+    return _denoised(options, settings.preset, fit)
 
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -18,7 +18,7 @@ _MITSUBA_BYTES_PER_VALUE = 18
 
 
 def pixels_that_fit(bytes_per_pixel: int) -> int:
-    """Return the size of the largest picture that can be rendered with the memory that is available."""
+    """Return the size of the largest picture for which there is memory."""
     available = _available_bytes()
     return MAX_PIXELS if available is None else min(MAX_PIXELS, available // bytes_per_pixel)
 
