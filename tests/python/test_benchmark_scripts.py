@@ -52,6 +52,13 @@ def test_calibration(rows, room):
     assert -1 <= float(rank) <= 1
 
 
+def test_sizes(rows, room):
+    ((size, seconds, microseconds, gib),) = rows("sizes.py", "--preset", "draft", room, "30x20")
+    assert size == "30x20"
+    assert float(microseconds) == pytest.approx(1e6 * float(seconds) / (30 * 20), rel=0.01)
+    assert 0.02 < float(gib) < 4
+
+
 def test_stopping(rows, room):
     found = rows("stopping.py", room)
     assert [name.split(",")[0] for name, _ in found] == ["draft", "balanced"]

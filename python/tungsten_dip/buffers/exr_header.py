@@ -40,7 +40,7 @@ def _readable_headers(stream: BinaryIO) -> tuple[bytes, list[str]]:
     After 8 bytes, a header is a series of attributes: name, 0, type, 0, the size of the value in 4 bytes, the
     value. A 0 ends it, and one more the last of several ("OpenEXR File Layout", openexr.com).
     """
-    kept = stream.read(8)
+    kept = bytearray(stream.read(8))
     left_out = []
     ends, ended = 2 if kept[5] & _SEVERAL_PARTS else 1, 0
     while ended < ends:
@@ -59,7 +59,7 @@ def _readable_headers(stream: BinaryIO) -> tuple[bytes, list[str]]:
             left_out.append(f"attribute {escaped(name)} is left out: {reason}")
             continue
         kept += b"\0".join((name, kind, size + value))
-    return kept, left_out
+    return bytes(kept), left_out
 
 
 def _text(stream: BinaryIO) -> bytes:
