@@ -53,6 +53,19 @@ def test_all_samples_keep_what_is_given_back() -> None:
     np.testing.assert_allclose(result.color, (result.halves[0] + result.halves[1]) / 2, rtol=1e-6)
 
 
+def test_all_samples_make_nothing_negative_of_what_is_given_back_to_the_dark() -> None:
+    truth = np.full(SHAPE, 0.2, np.float32)
+    truth[10:20, 20:34] = 0.01
+    a, b = _halves(truth, 32.0)
+    evidence = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
+    darker, brighter = (np.full(SHAPE, level * evidence.scale, np.float32) for level in (0.16, 0.24))
+    dark = np.full(SHAPE, 0.02 * evidence.scale, np.float32)
+    result = denoised_image(evidence, (darker, brighter), dark, DRAFT, Clock())
+    assert not any("is returned" in note for note in result.notes)
+    assert result.color[10:20, 20:34].mean() < 0.1
+    assert result.color.min() >= 0
+
+
 def test_nothing_is_given_back_on_the_word_of_one_half() -> None:
     truth = np.full(SHAPE, 0.2, np.float32)
     halves = _halves(truth, 32.0)

@@ -137,9 +137,7 @@ def fit_blend(
             training.notes.append(f"interrupted after the training of {training.steps_done} steps")
         all_samples_pilots = beside.result()
     if training.interrupted and preset.all_samples and not all_samples_pilots:
-        training.notes.append(
-            "the pilots of all samples were not complete: the image is made of the halves alone"
-        )
+        training.notes.append("without the pilots of all samples: the image is made of the halves alone")
     inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
     denoised, all_samples_blend = blended_images(network, inputs, evidence, all_samples_pilots)
     result = denoised_image(evidence, denoised, all_samples_blend, settings, clock)

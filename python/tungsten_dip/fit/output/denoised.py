@@ -72,8 +72,9 @@ def denoised_image(
 ) -> FitResult:
     """Make the image from the network's outputs for both halves, or from the input if that is as good.
 
-    ``all_samples_blend`` are the pilots of all samples, blended with the mean of both halves' weights. The
-    result is that of a network without training (``iterations`` 0), and without its ``model``.
+    ``all_samples_blend`` are the pilots of all samples, blended with the mean of both halves' weights; it
+    gets the same detail back as the halves' blends. The result is that of a network without training
+    (``iterations`` 0), and without its ``model``.
     """
     threads = evidence.threads
     blended = mean_of(denoised)
@@ -81,7 +82,8 @@ def denoised_image(
     image = mean_of(denoised)
     if all_samples_blend is not None:
         # What the halves' blends lost, that of all samples lost with the same weights.
-        image = with_all_samples(denoised, all_samples_blend + (image - blended), threads)
+        with_detail = np.maximum(all_samples_blend + (image - blended), 0)
+        image = with_all_samples(denoised, with_detail, threads)
     pixels = denoised[0].reshape(-1, 3), denoised[1].reshape(-1, 3)
     error = estimate_error(evidence.candidates, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 
