@@ -22,7 +22,7 @@ from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
 from tungsten_dip.sequence.following import Follower, Models, _typical_error
-from tungsten_dip.sequence.frames import find_frames, numbers_from_text, text_from_numbers
+from tungsten_dip.sequence.frames import RECORD, find_frames, numbers_from_text, text_from_numbers
 from tungsten_dip.sequence.reprojection import check_camera, reproject
 
 DRAFT = FitSettings(preset="draft", threads=1)
@@ -86,9 +86,12 @@ def test_results_that_a_glob_matches_are_no_frames(tmp_path, fitted, frame, outp
         (tmp_path / f"f{number:04d}").mkdir()
     outputs = f"{tmp_path}/{outputs.format(tmp_path.name)}"
     frames = find_frames(f"{tmp_path}/f*", outputs)
+    result = replace(frame.buffers, attributes={RECORD: "{}"})
     for each in frames[:2]:
-        write_denoised(each.output, fitted, frame.buffers)
+        write_denoised(each.output, fitted, result)
     assert find_frames(f"{tmp_path}/f*", outputs) == frames
+    (tmp_path / "f0001").rmdir()
+    assert [each.number for each in find_frames(f"{tmp_path}/f*", outputs)] == [0, 2]
 
 
 def test_inputs_that_are_named_like_results_are_frames(tmp_path, fitted, frame):

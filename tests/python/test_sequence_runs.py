@@ -164,7 +164,7 @@ def test_a_frame_whose_record_is_damaged_is_done_again(frames):
     work.denoise_frames([frame], RUN)
     for record in ("[" * 100_000, "[]", "{"):
         (part,) = read_parts(frame.output)
-        write_exr(frame.output, [replace(part, attributes={**part.attributes, work._RECORD: record})])
+        write_exr(frame.output, [replace(part, attributes={**part.attributes, work.RECORD: record})])
         assert work.finished(frame, RUN) is None
 
 

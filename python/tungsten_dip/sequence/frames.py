@@ -10,8 +10,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from tungsten_dip.buffers.image_file import read_attributes
-from tungsten_dip.buffers.source import ADDED
+from tungsten_dip.buffers.source import OWN
 from tungsten_dip.errors import InputError
+
+RECORD = OWN + "frame"
+"""The attribute of a frame's file that holds its record."""
 
 _NUMBER = re.compile(r"##+|%0?(\d+)d")
 _ONE_SIGN = re.compile(r"#|%(\d*)d")
@@ -133,16 +136,10 @@ def _globbed(pattern: str, outputs: str) -> dict[int, Path]:
         raise InputError(
             f"{pattern}: expected a place for the frame's number, such as f####, f%04d or f*; or use denoise"
         )
-    paths = _glob(pattern)
-    outputs_there = {path.resolve(): number for number, path in _numbered(outputs).items()}
-    results = {
-        path: number
-        for path in paths
-        if (number := outputs_there.get(path.resolve())) is not None and _is_denoised(path)
-    }
+    outputs_there = {path.resolve() for path in _numbered(outputs).values()}
     found: dict[int, Path] = {}
-    for path in sorted(paths, key=results.__contains__):
-        if results.get(path) in found:
+    for path in _glob(pattern):
+        if path.resolve() in outputs_there and _is_result(path):
             continue
         digits = re.findall(r"\d+", path.stem if path.is_file() else path.name)
         if not digits:
@@ -154,9 +151,9 @@ def _globbed(pattern: str, outputs: str) -> dict[int, Path]:
     return found
 
 
-def _is_denoised(path: Path) -> bool:
+def _is_result(path: Path) -> bool:
     try:
-        return ADDED in read_attributes(path)
+        return RECORD in read_attributes(path)
     except InputError:  # any other file that is named like a result
         return False
 

@@ -17,19 +17,15 @@ from typing import Any, Literal
 
 from tungsten_dip.buffers.image_file import is_whole, read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
-from tungsten_dip.buffers.source import OWN
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_scene
 from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
-from tungsten_dip.sequence.frames import Frame
+from tungsten_dip.sequence.frames import RECORD, Frame
 
 _LOG = logging.getLogger(__name__)
-
-_RECORD = OWN + "frame"
-"""The attribute of a frame's file that holds its record."""
 
 _NOT_OF_THE_IMAGE = ("threads", "device")
 """Settings that may differ between the runs of one sequence."""
@@ -83,7 +79,7 @@ def finished(frame: Frame, run: Run) -> Record | None:
     if not frame.output.is_file():
         return None
     try:
-        stored = json.loads(read_attributes(frame.output)[_RECORD])
+        stored = json.loads(read_attributes(frame.output)[RECORD])
         if stored.pop("key") != key or not is_whole(frame.output):
             return None
         return Record(**{**stored, "number": frame.number, "output": str(frame.output), "skipped": True})
@@ -159,7 +155,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, p
         estimated_relmse=result.estimated_relmse,
         flicker=followed.flicker if is_consecutive else None,
     )
-    attributes = {**buffers.attributes, _RECORD: json.dumps({"key": key, **asdict(record)})}
+    attributes = {**buffers.attributes, RECORD: json.dumps({"key": key, **asdict(record)})}
     frame.output.parent.mkdir(parents=True, exist_ok=True)
     write_denoised(frame.output, result, replace(buffers, attributes=attributes), float16=run.float16)
     return record
