@@ -78,6 +78,7 @@ def test_too_little_memory_is_told_before_the_fit(
         assert command.main(arguments) == 0
         err = capfd.readouterr().err
         assert (warning in err) == (f"expected {pixels} at most" in err) == told
+        assert ("use --preset draft" in err) == (told and preset != "draft")
 
 
 def test_options_become_settings(folder, tmp_path, fits):

@@ -135,11 +135,12 @@ def warn_of_little_memory(path: Path, buffers: RenderBuffers, preset: Preset) ->
         if buffers.width * buffers.height > most:
             _LOG.warning(
                 "%s: there may be too little memory for %d x %d pixels, with which the system may end this "
-                "without a word: expected %d at most; free some, crop it or use --preset draft",
+                "without a word: expected %d at most; free some%s",
                 path,
                 buffers.width,
                 buffers.height,
                 most,
+                " or crop it" if preset == "draft" else ", crop it or use --preset draft",
             )
 
 
