@@ -786,6 +786,13 @@ def test_attributes_that_python_cannot_hold_are_left_out_and_told(
     assert image_file.read_attributes(tmp_path / "a.exr").keys() >= {"dataWindow", "good"}
 
 
+def test_names_that_would_be_one_in_utf8_are_refused(tmp_path: Path) -> None:
+    save(tmp_path / "a.exr", *"RGB", r"caf\xe9.Z", "cafe.Z")
+    content = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(content.replace(b"cafe.Z", b"caf\xe9.Z"))
+    refused(tmp_path / "a.exr", "expected channels of different names")
+
+
 def test_a_header_that_claims_too_much_is_refused(tmp_path: Path) -> None:
     save(tmp_path / "a.exr", *"RGB")
     data = bytearray((tmp_path / "a.exr").read_bytes())

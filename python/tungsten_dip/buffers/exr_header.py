@@ -64,10 +64,10 @@ def _readable_headers(stream: BinaryIO) -> tuple[bytes, list[str]]:
 
 def _text(stream: BinaryIO) -> bytes:
     """Read up to the next 0."""
-    text = b""
+    text = bytearray()
     while (byte := stream.read(1)) not in (b"\0", b""):
         text += byte
-    return text
+    return bytes(text)
 
 
 def _why_unreadable(name: bytes, kind: bytes, value: bytes) -> str:
@@ -77,7 +77,7 @@ def _why_unreadable(name: bytes, kind: bytes, value: bytes) -> str:
         for text in (name, *_texts(kind, value)):
             text.decode()
     except UnicodeDecodeError:
-        return f"expected text in UTF-8, got '{escaped(text):.40}'"
+        return f"expected text in UTF-8, got '{escaped(text[:40]):.40}'"
     return ""
 
 

@@ -326,6 +326,8 @@ def _part(path: Path, image: Any, index: int) -> Part:
     if suffix == ".pfm":
         _check_pfm(path)
     part_name, *names = _utf8_names(path, [spec.getattribute("oiio:subimagename") or "", *spec.channelnames])
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: expected channels of different names, got two of one name; rename one")
     channels: dict[str, Channel] = {}
     begin = 0
     while begin < spec.nchannels:
