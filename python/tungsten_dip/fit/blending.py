@@ -48,7 +48,7 @@ _SMALL_BATCH_PIXELS = 1 << 13
 """Pixels of a step, at most. The small batch is enough for the pilots of draft, and beside a previous frame;
 with more of them the rims of lamps, few pixels, come out worse."""
 
-_STEPS_OF_ONE = 240
+STEPS_OF_ONE_NETWORK = 240
 """Steps of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
 
 
@@ -164,7 +164,7 @@ def _preset(settings: FitSettings, following: bool) -> _Preset:
     preset = _PRESETS[settings.preset]
     if preset.members > 1 and (following or settings.time_budget_s is not None):
         # A time budget, or the little time of a frame, is better spent on the steps of one network.
-        preset = replace(preset, members=1, steps=_STEPS_OF_ONE)
+        preset = replace(preset, members=1, steps=STEPS_OF_ONE_NETWORK)
     if following:
         # The previous frame moved into place has no counterpart among the pilots of all samples.
         preset = replace(preset, pilots=preset.following, batch_pixels=_SMALL_BATCH_PIXELS, all_samples=False)

@@ -19,7 +19,7 @@ from tungsten_dip.buffers.render_buffers import FEATURES, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
-from tungsten_dip.fit.blending import fit_blend
+from tungsten_dip.fit.blending import STEPS_OF_ONE_NETWORK, fit_blend
 from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots.surfaces import alpha_as_albedo
@@ -35,10 +35,6 @@ _LOG = logging.getLogger(__name__)
 
 Refit = int | Literal["auto"]
 How = Literal["fitted", "followed", "cut"]
-
-_MOST_STEPS = 240
-"""Steps of a network that is trained further, and of a new one for frames that follow: as many as one network
-by itself needs (`fit.blending`)."""
 
 _LEAST_IN_SIGHT = 0.3
 """Part of the picture that the previous frame must show of this one; below, it is another scene."""
@@ -182,12 +178,12 @@ class Follower:
         model = self.models.alone if moved is None else self.models.following
         if model is None and moved is None:
             return None
-        steps = _MOST_STEPS if self._refit == "auto" else self._refit
+        steps = STEPS_OF_ONE_NETWORK if self._refit == "auto" else self._refit
         try:
             if model is not None and steps == 0:
                 result = infer_blend(model, buffers, self._settings, progress, previous=moved)
             else:
-                of_new = self._settings.iterations if moved is None else _MOST_STEPS
+                of_new = self._settings.iterations if moved is None else STEPS_OF_ONE_NETWORK
                 settings = replace(self._settings, iterations=of_new)
                 result = fit_blend(buffers, settings, progress, model, moved, refit_steps=steps)
         except InputError as problem:
