@@ -121,6 +121,18 @@ def test_signs_in_a_folders_name_are_no_places_where_there_are_longer_ones(tmp_p
     assert str(frame.output) == "r0007/f0007.exr"
 
 
+@pytest.mark.parametrize("name", ["sh#2", "50%done"])
+def test_a_single_sign_in_a_folders_name_is_no_place(tmp_path, name):
+    (tmp_path / name / "f0007").mkdir(parents=True)
+    folder = f"{tmp_path}/{name}"
+    for inputs in (f"{folder}/f*", f"{folder}/f000#", f"{folder}/f000%d/"):
+        (frame,) = find_frames(inputs, f"{folder}/o#.exr", scenes=f"{folder}/c0.json")
+        assert (frame.number, frame.input) == (7, tmp_path / name / "f0007")
+        assert (str(frame.output), str(frame.scene)) == (f"{folder}/o7.exr", f"{folder}/c0.json")
+    with pytest.raises(InputError, match="place for the frame's number"):
+        find_frames(f"{folder}/f*", f"{folder}/o.exr")
+
+
 def test_frames_asked_for_need_not_exist(folders):
     frames = find_frames(f"{folders}/f####", "o####.exr", (1, 2))
     assert [frame.input.exists() for frame in frames] == [True, False]

@@ -17,8 +17,8 @@ RECORD = OWN + "frame"
 """The attribute of a frame's file that holds its record."""
 
 _NUMBER = re.compile(r"##+|%0?(\d+)d")
-_ONE_SIGN = re.compile(r"#|%(\d*)d")
-"""Counts only where nothing longer does: folders may be called ``take#2`` or ``50%done``."""
+_ONE_SIGN = re.compile(r"(?:#|%(\d*)d)(?=[^/]*/*$)")
+"""Counts only in the last name of a path, where nothing longer does: folders may be called ``take#2``."""
 
 _MOST_FRAMES = 1_000_000
 """Frames in one range of numbers: they are all held in memory, and more than that is a slip."""
@@ -69,8 +69,9 @@ def find_frames(
 ) -> list[Frame]:
     """Return the frames in the order of their numbers.
 
-    ``inputs`` has a place for the number (``####``, ``%04d``) or is a glob pattern, whose files are numbered
-    by the last digits of their names; results of these frames that it matches as well are left out.
+    ``inputs`` has a place for the number (``####``, ``%04d``; ``#`` and ``%d`` in the last name of the path
+    alone) or is a glob pattern, whose files are numbered by the last digits of their names; results of these
+    frames that it matches as well are left out.
     ``outputs`` has a place for the number, and so has ``scenes``, unless the camera stands still. Of
     ``numbers``, every one is a frame, whether its files exist or not; None means what is there. They are a
     step apart, that of the two closest ones: of 1, 3, 5, 9 one is missing.
