@@ -9,7 +9,7 @@ import pytest
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.scene import types as t
-from tungsten_dip.scene.parse import load_scene
+from tungsten_dip.scene.parse import load_camera, load_scene
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*/scene.json"))
 
@@ -282,6 +282,34 @@ def test_files_are_looked_for_in_the_input_directory(load, tmp_path):
     (tmp_path / "scene.json").write_text(json.dumps(sphere(emission="q.png")))
     scene = load_scene(tmp_path / "scene.json", input_directory=other)
     assert scene.primitives[0].emission.file == other / "q.png"
+
+
+def test_a_camera_is_read_without_the_files_of_its_scene(tmp_path):
+    place = {"position": [0, 0, 5]}
+    scene = {
+        "bsdfs": [{"name": "wood", "type": "lambert", "albedo": "none.png"}],
+        "primitives": [
+            {"name": "it", "type": "mesh", "file": "none.wo3", "bsdf": "wood", "transform": place}
+        ],
+        "camera": {
+            "type": "thinlens",
+            "fov": 40,
+            "focus_pivot": "it",
+            "aperture": {"type": "bitmap", "file": "none.png"},
+        },
+    }
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(scene))
+    camera = load_camera(path)
+    assert isinstance(camera, t.ThinlensCamera)
+    distance = np.linalg.norm(camera.world_from_local[:3, 3] - (0, 0, 5))
+    assert (camera.fov, camera.focus_distance) == (40, pytest.approx(distance))
+    with pytest.raises(InputError, match="found none"):
+        load_scene(path)
+    scene["primitives"][0]["bsdf"] = "stone"
+    path.write_text(json.dumps(scene))
+    with pytest.raises(InputError, match="the name of a BSDF"):
+        load_camera(path)
 
 
 def test_references_lead_to_the_same_object(load):

@@ -201,6 +201,15 @@ def test_flicker_is_not_told_across_a_gap_but_of_every_other_frame(frames, capfd
         assert [record["flicker"] is not None for record in told(capfd)["frames"]] == expected
 
 
+def test_cameras_need_no_files_of_their_scenes(frames, capfd):
+    for path in Path("cameras").glob("*.json"):
+        scene = json.loads(path.read_text())
+        scene["primitives"] = [{"type": "mesh", "file": "none.wo3", "bsdf": {"type": "null"}}]
+        path.write_text(json.dumps(scene))
+    assert main(arguments("--json", "--frames", "0-1", "--refit", "0")) == 0
+    assert [record["error"] for record in told(capfd)["frames"]] == [None, None]
+
+
 def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
     (frames / "cameras/f0002.json").unlink()

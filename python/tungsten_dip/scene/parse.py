@@ -89,11 +89,23 @@ def load_scene(path: Path | str, input_directory: Path | str | None = None) -> S
     remedy.
     """
     path = Path(path)
-    raw = object_from_json_file(path)
+    return _read(_Parser(path, None if input_directory is None else Path(input_directory)))
+
+
+def load_camera(path: Path | str) -> Camera:
+    """Read the camera of a scene file; the textures and meshes that the scene names need not be there.
+
+    Raises InputError as `load_scene` does.
+    """
+    return _read(_Parser(Path(path), None, files_exist=False)).camera
+
+
+def _read(parser: _Parser) -> Scene:
+    raw = object_from_json_file(parser.path)
     try:
-        return _Parser(path, None if input_directory is None else Path(input_directory)).scene(raw)
+        return parser.scene(raw)
     except RecursionError:
-        raise InputError(f"{path}: objects are nested too deeply; flatten the scene") from None
+        raise InputError(f"{parser.path}: objects are nested too deeply; flatten the scene") from None
 
 
 def _types_by_name(family: type[Any]) -> dict[str, type[Any]]:
@@ -144,10 +156,14 @@ class _MissingFileError(InputError):
 
 
 class _Parser:
-    """The state while reading: the objects declared and the files named so far, and the fields ignored."""
+    """The state while reading: the objects declared and the files named so far, and the fields ignored.
 
-    def __init__(self, path: Path, input_directory: Path | None) -> None:
+    ``files_exist``: a file that the scene names has to exist.
+    """
+
+    def __init__(self, path: Path, input_directory: Path | None, files_exist: bool = True) -> None:
         self.path = path
+        self.files_exist = files_exist
         self.input_directory = input_directory
         self.folder = path.parent if input_directory is None else input_directory
         self.named: dict[type, dict[str, Any]] = {Bsdf: {}, Medium: {}}
@@ -287,7 +303,7 @@ class _Parser:
             raise self.fail(where, "the name of a file", value, "name the file")
         path = self.folder / value
         try:
-            exists = path.exists()
+            exists = not self.files_exist or path.exists()
         except (OSError, ValueError):
             exists = False
         if not exists:

@@ -21,7 +21,7 @@ from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, part_of, silent
-from tungsten_dip.scene.parse import load_scene
+from tungsten_dip.scene.parse import load_camera
 from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
 from tungsten_dip.sequence.frames import RECORD, Frame
 
@@ -140,7 +140,7 @@ def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, p
     started = time.perf_counter()
     key = _key(frame, run)
     buffers = read_buffers(frame.input, run.mapping)
-    camera = None if frame.scene is None else load_scene(frame.scene).camera
+    camera = None if frame.scene is None else load_camera(frame.scene)
     followed = follower.denoise(buffers, camera, progress)
     result = followed.result
     if result.interrupted:
