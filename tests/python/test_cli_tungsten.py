@@ -399,6 +399,8 @@ def test_a_render_that_fails_does_not_keep_the_next_one_from_being_denoised(
         ("--dip-denoise --dip-warm-start {tmp}/none.onnx {scene}", ["{tmp}/none.onnx", "cannot be read"]),
         ("-o {tmp}/none/a.png {scene}", ["{tmp}/none/a.png"]),
         ("-o {tmp}/a.jpg {scene}", ["{tmp}/a.jpg", ".png"]),
+        ("-i {tmp}/none {scene}", ["-i {tmp}/none: no such folder"]),
+        ("-i {scene} {scene}", ["-i {scene}: no such folder"]),
         ("-c 10m {scene}", ["--checkpoint", "--host tungsten"]),
         ("--host tungsten --dip-denoise --dip-preview -c 0 {scene}", ["--checkpoint 0", "--dip-preview"]),
         ("--timeout x {scene}", ["--timeout"]),

@@ -120,6 +120,8 @@ def _run(arguments: Sequence[str] | None) -> None:
         path, count = getattr(options, name), len(options.scenes)
         if path is not None and count > 1:
             raise InputError(f"{path}: one file for {count} scenes; render them one at a time")
+    if options.input_directory is not None and not options.input_directory.is_dir():
+        raise InputError(f"-i {options.input_directory}: no such folder; check the name")
 
     host = chosen_host(options.host)
     _LOG.info("rendering with %s", host.capitalize())
