@@ -207,6 +207,7 @@ def test_numbers_that_infer_cannot_take_are_told_before_anything_is_read(
         (["denoise", "--pilot", "oidn"], False, "needs pyoidn"),
         (["infer", "{oidn}"], False, "needs pyoidn"),
         (["infer", "{paper}", "--refit", "5"], True, "expected 0 steps of a network of preset paper"),
+        (["infer", "{plain}", "--save-model", "q.onnx"], True, "--save-model: without --refit"),
     ],
 )
 def test_what_needs_no_input_is_checked_before_it_is_read(

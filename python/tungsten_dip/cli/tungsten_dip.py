@@ -168,6 +168,11 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     whole_number("--refit", options.refit, 0, MOST_ITERATIONS)
+    if options.save_model is not None and options.refit == 0:
+        raise InputError(
+            f"--save-model: without --refit the network is that of {options.model} still; add --refit N or "
+            f"omit --save-model"
+        )
     with deferred_interrupts():
         from tungsten_dip.onnx.inference import inference_settings
 
