@@ -307,11 +307,13 @@ def test_all_that_can_be_measured_here_is_shown_in_table_plot_and_page(folder, b
     pytest.importorskip("pyoidn", reason="pyoidn is not installed")
     write_image(folder / "nfor.exr", bench_set.reference * np.float32(1.1))
     sets = read_sets([str(folder)])
-    plan = Plan(presets=("draft",), budgets_s=(0.5,), paper_iterations=3, repeats=1, threads=1, nfor_s=4)
+    plan = Plan(
+        presets=("draft", "final"), budgets_s=(0.5,), paper_iterations=3, repeats=1, threads=1, nfor_s=4
+    )
     (found,) = run_pareto(sets, plan, tmp_path / "bench")
     labels = [row.label for row in found.rows]
     oidn = ["OIDN fast", "OIDN balanced", "OIDN high"]
-    ours = ["draft", "final, with OIDN as a pilot", "final in 0.5 s"]
+    ours = ["draft", "final", "final, with OIDN as a pilot", "final in 0.5 s"]
     assert labels == ["noisy", *ours, "paper, 3 iterations", *oidn, "NFOR"]
     assert found.rows[-1].median.seconds == 4
     by_label = {row.label: row.median for row in found.rows}
@@ -332,6 +334,15 @@ def test_all_that_can_be_measured_here_is_shown_in_table_plot_and_page(folder, b
     assert all(f'alt="{label}"' in html for label in ("reference", "noisy", "draft", "OIDN high", "NFOR"))
     assert all(f'alt="error of {label}"' in html for label in ("noisy", "draft", "OIDN high", "NFOR"))
     assert_page_works(page)
+
+
+@pytest.mark.parametrize("presets", [("draft",), ("draft", "final")])
+def test_final_is_guided_by_oidn_only_where_final_is_asked_for(bench_set, fits, tmp_path, presets):
+    pytest.importorskip("pyoidn", reason="pyoidn is not installed")
+    plan = replace(QUICK, kinds=("presets", "oidn"), presets=presets, repeats=1)
+    run_pareto([bench_set], plan, tmp_path)
+    guided = [("final", "oidn")] if "final" in presets else []
+    assert [(each.preset, each.pilot) for each in fits] == [*((p, "none") for p in presets), *guided]
 
 
 def test_peers_that_are_missing_are_left_out_and_that_is_said(bench_set, fits, tmp_path, monkeypatch, caplog):

@@ -174,7 +174,7 @@ def _methods(bench_set: BenchSet, plan: Plan, scene: Path | None) -> Iterator[Me
         for preset in plan.presets:
             settings = FitSettings(preset, threads=plan.threads)
             yield _ours(bench_set, OURS, preset, preset, settings, pictured=True)
-        if "oidn" in plan.kinds:
+        if "oidn" in plan.kinds and "final" in plan.presets:
             guided = FitSettings("final", pilot="oidn", threads=plan.threads)
             yield _ours(bench_set, OURS, "final, with OIDN as a pilot", "with OIDN", guided, pictured=True)
     if "budgets" in plan.kinds:
