@@ -34,6 +34,9 @@ INVISIBLE = 1e-4
 LEAST_FAR = 0.5
 """Part of the image that must be out of reach: the mean of few noisy pixels says nothing."""
 
+ROUNDING = 1e-6
+"""Part by which an error may differ that comes from rounding alone."""
+
 MOST_HARM = 1.5
 """How many times larger the error of good pixels may be than without the damage."""
 
@@ -75,7 +78,7 @@ class Outcome:
             broken["finite"] = "finite"
         if self.drift is not None and not abs(self.drift) <= self.most_drift:
             broken["mean"] = f"mean {self.drift:+.1%}"
-        most = None if self.input_error is None else max(self.input_error, INVISIBLE)
+        most = None if self.input_error is None else max(self.input_error * (1 + ROUNDING), INVISIBLE)
         if self.error is not None and most is not None and not self.error <= most:
             broken["error"] = f"error {self.error:.2g} > {self.input_error:.2g}"
         if self.harm is not None and not self.harm <= MOST_HARM:
