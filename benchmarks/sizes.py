@@ -36,7 +36,7 @@ def main() -> None:
     for size in options.sizes:
         width, height = (int(number) for number in size.split("x"))
         seconds, gib = _measured(_filling(buffers, width, height), options.preset)
-        print(f"| {size} | {seconds:.3g} | {1e6 * seconds / (width * height):.3g} | {gib:.2g} |", flush=True)
+        print(f"| {size} | {seconds:.3g} | {1e6 * seconds / (width * height):.3g} | {gib:.3g} |", flush=True)
 
 
 def _filling(buffers: RenderBuffers, width: int, height: int) -> RenderBuffers:
