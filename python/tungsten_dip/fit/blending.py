@@ -42,7 +42,6 @@ from tungsten_dip.progress import Progress
 _LARGE_RADIUS = 18
 """Windows of a larger radius are left out where they would cover the whole image."""
 
-
 _BATCH_PIXELS = 1 << 14
 _SMALL_BATCH_PIXELS = 1 << 13
 """Pixels of a step, at most. The small batch is enough for the pilots of draft, and beside a previous frame;

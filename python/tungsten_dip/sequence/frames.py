@@ -70,11 +70,11 @@ def find_frames(
     """Return the frames in the order of their numbers.
 
     ``inputs`` has a place for the number (``####``, ``%04d``; ``#`` and ``%d`` in the last name of the path
-    alone) or is a glob pattern, whose files are numbered by the last digits of their names; results of these
-    frames that it matches as well are left out.
-    ``outputs`` has a place for the number, and so has ``scenes``, unless the camera stands still. Of
-    ``numbers``, every one is a frame, whether its files exist or not; None means what is there. They are a
-    step apart, that of the two closest ones: of 1, 3, 5, 9 one is missing.
+    alone) or is a glob pattern, whose files are numbered by the last digits of their names; results of a
+    sequence that it matches as well, where ``outputs`` puts them, are left out. ``outputs`` has a place for
+    the number, and so has ``scenes``, unless the camera stands still. Of ``numbers``, every one is a frame,
+    whether its files exist or not; None means what is there. They are a step apart, that of the two closest
+    ones: of 1, 3, 5, 9 one is missing.
 
     Raises InputError if a pattern has no place for a number, or nothing matches it.
     """

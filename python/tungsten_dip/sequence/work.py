@@ -113,8 +113,7 @@ def denoise_frames(
 
     Frames that are finished are skipped; one that cannot be done, for whatever reason, has an error in its
     record, and the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short
-    is not saved.
-    ``on_record`` gets every record as soon as it is known.
+    is not saved. ``on_record`` gets every record as soon as it is known.
     """
     follower = Follower(run.settings, run.refit, models)
     frames = list(frames)
