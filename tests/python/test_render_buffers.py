@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tungsten_dip as dip
-from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers, mean_of, variance_of_mean
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
@@ -156,3 +156,10 @@ def test_impossible_numbers_of_samples_in_a_pixel_are_refused(spp):
     counts[1, 2] = spp
     with pytest.raises(InputError, match=r"^spp: expected numbers from 0 to"):
         RenderBuffers(Buffer(GREY), spp=counts)
+
+
+def test_the_variance_of_the_mean_is_what_independent_halves_scatter_by():
+    random = np.random.default_rng(1)
+    half_a, half_b = random.normal(5, 2, (2, 300, 400, 3)).astype(np.float32)
+    spread = mean_of((half_a, half_b)).var()
+    assert variance_of_mean((half_a, half_b)).mean() == pytest.approx(spread, rel=0.02)

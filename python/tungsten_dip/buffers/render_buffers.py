@@ -171,6 +171,12 @@ def mean_of(halves: Halves) -> FloatImage:
     return mean
 
 
+def variance_of_mean(halves: Halves) -> FloatImage:
+    """Return the variance of `mean_of`, as halves with independent noise show it: (A - B)^2 / 4, unbiased."""
+    variance: FloatImage = np.float32(0.25) * (halves[0] - halves[1]) ** 2
+    return variance
+
+
 def _differs(now: object, read: object) -> bool:
     """Whether this is another image, or another number."""
     if isinstance(now, (int, float)) and isinstance(read, (int, float)):
