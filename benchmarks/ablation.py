@@ -12,31 +12,30 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from tungsten_dip.bench.sets import read_sets
 from tungsten_dip.buffers import prefilter
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit import FitSettings, blending, denoise, evidence
-from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit import FitSettings, denoise, evidence
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.output import all_samples
 from tungsten_dip.fit.pilots import surfaces
+from tungsten_dip.fit.presets import RECIPES
 from tungsten_dip.report.metrics import compare
+
+BALANCED = RECIPES["balanced"]
 
 Change = Callable[[], AbstractContextManager[object]]
 
 
+def _recipe(**changes: Any) -> Change:
+    return lambda: mock.patch.dict(RECIPES, balanced=replace(BALANCED, **changes))
+
+
 def _without(unwanted: Callable[[Pilot], bool]) -> Change:
-    preset = blending._PRESETS["balanced"]
-    kept = tuple(pilot for pilot in preset.pilots if not unwanted(pilot))
-    return lambda: mock.patch.dict(blending._PRESETS, balanced=replace(preset, pilots=kept))
-
-
-def _with_one_pilot() -> AbstractContextManager[object]:
-    preset = blending._PRESETS["balanced"]
-    return mock.patch.dict(
-        blending._PRESETS, balanced=replace(preset, pilots=(Pilot("guided", 10, step=2, k=1.0),))
-    )
+    return _recipe(pilots=tuple(pilot for pilot in BALANCED.pilots if not unwanted(pilot)))
 
 
 @contextmanager
@@ -49,14 +48,10 @@ def _with_occupied_space() -> Iterator[None]:
 
 
 VARIANTS: dict[str, Change] = {
-    "balanced": lambda: mock.patch.dict(blending._PRESETS),
-    "hardly trained (1 step)": lambda: mock.patch.object(
-        blending, "_PRESETS", {"balanced": replace(blending._PRESETS["balanced"], steps=1)}
-    ),
-    "one network instead of two": lambda: mock.patch.object(
-        blending, "_PRESETS", {"balanced": replace(blending._PRESETS["balanced"], members=1)}
-    ),
-    "one pilot and the noisy image": _with_one_pilot,
+    "balanced": _recipe(),
+    "hardly trained (1 step)": _recipe(steps=1),
+    "one network instead of two": _recipe(members=1),
+    "one pilot and the noisy image": _recipe(pilots=(Pilot("guided", 10, step=2, k=1.0),)),
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
     "only guided pilots": _without(lambda pilot: pilot.kind == "features"),
     "no regression on the position": _without(lambda pilot: pilot.with_position),
@@ -66,7 +61,7 @@ VARIANTS: dict[str, Change] = {
     "emitted light not smoothed along edges": lambda: mock.patch.object(
         surfaces, "_smooth_emission", lambda emission, filtered, *_: filtered
     ),
-    "no pilots of all samples": lambda: mock.patch.object(blending, "pilots_of_all_samples", return_value=()),
+    "no pilots of all samples": _recipe(all_samples=False),
     "empty space like any other": _with_occupied_space,
 }
 

@@ -2,7 +2,8 @@
 
     python benchmarks/stopping.py renders/cornell-box/n4=renders/cornell-box/reference.exr ...
 
-prints a Markdown table. The image is compared every 20 steps, before it is blended with the noisy pixels.
+prints a Markdown table. The image is compared every 20 steps: the blend of the halves' candidates, to
+which neither lost detail nor the pilots of all samples have been added.
 """
 
 import argparse
@@ -39,9 +40,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
             if self.steps % EVERY == 0:
                 evidence, examples = starts[-1].evidence, starts[-1].examples
                 of_halves = [
-                    self.blend(
-                        examples.of_half(half).inputs, [candidate[half] for candidate in evidence.candidates]
-                    )
+                    self.blend(examples.of_half(half).inputs, evidence.candidates.of_half(half))
                     for half in (0, 1)
                 ]
                 image = np.float32(0.5 / evidence.scale) * (of_halves[0] + of_halves[1])

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 def thread_count(threads: int | None) -> int:
     """Return ``threads`` or, for None, one for each core that this process may run on."""
-    if threads:
+    if threads is not None:
         return threads
     # macOS has no affinity.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

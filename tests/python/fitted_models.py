@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.evidence import Evidence, evidence_from_buffers
+from tungsten_dip.fit.evidence import Cues, Evidence, evidence_from_buffers
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.preparation.splitting import HalvedImage
 from tungsten_dip.graphs.sessions import session_from_proto
@@ -32,9 +34,9 @@ def session_of(model: Model) -> Any:
     return session_from_proto(graph_of(model), 1)
 
 
-def evidence_of(buffers: RenderBuffers, pilots: Any) -> Evidence:
-    """Return what a fit of preset draft knows of the buffers, with other pilots."""
-    return evidence_from_buffers(HalvedImage(buffers), DRAFT, pilots, Clock(), silent, None)
+def evidence_of(buffers: RenderBuffers, pilots: Sequence[Pilot]) -> tuple[Evidence, Cues]:
+    """Return what a fit with these pilots knows of the buffers."""
+    return evidence_from_buffers(HalvedImage(buffers), pilots, Clock(), silent, threads=1)
 
 
 def check_result(result: FitResult, buffers: RenderBuffers) -> None:

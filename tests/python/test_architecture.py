@@ -37,12 +37,39 @@ def test_the_table_lists_every_folder() -> None:
     assert {*folders, "root"} == set(layers())
 
 
+def parts_of_fit() -> list[str]:
+    """Return the folders and modules of the table of a fit, from the top down."""
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    table = page.partition("| folder or module of `fit/` |")[2].partition("\n\n")[0]
+    cells = re.findall(r"^\| (`[^|]*`) \|", table, flags=re.MULTILINE)
+    return [name.strip("/") for cell in cells for name in re.findall(r"`(\w+/?)`", cell)]
+
+
 def test_the_table_of_a_fit_lists_every_module() -> None:
     page = (ROOT / "docs" / "architecture.md").read_text()
     table = page.partition("| folder or module of `fit/` |")[2].partition("\n\n")[0]
     modules = {path.stem for path in (PACKAGE / "fit").rglob("*.py") if path.parent.name != "paper"}
-    folders = {f"{path.parent.name}/" for path in (PACKAGE / "fit").glob("*/__init__.py")}
-    assert (modules | folders) - {"__init__"} <= set(re.findall(r"`(\w+/?)`", table))
+    folders = {path.parent.name for path in (PACKAGE / "fit").glob("*/__init__.py")}
+    assert modules - {"__init__"} <= set(re.findall(r"`(\w+)`", table))
+    assert sorted(parts_of_fit()) == sorted(
+        folders | {path.stem for path in (PACKAGE / "fit").glob("*.py")} - {"__init__"}
+    )
+
+
+def test_imports_within_a_fit_point_downwards_only() -> None:
+    order = parts_of_fit()
+    checked, upwards = 0, []
+    for path in (PACKAGE / "fit").rglob("*.py"):
+        own = path.relative_to(PACKAGE / "fit").with_suffix("").parts[0]
+        for module in imported_modules(path):
+            parts = module.split(".")
+            if own == "__init__" or parts[:2] != ["tungsten_dip", "fit"] or parts[2] == own:
+                continue
+            checked += 1
+            if order.index(parts[2]) < order.index(own):
+                upwards.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert upwards == []
+    assert checked > 50
 
 
 def test_imports_point_downwards_only() -> None:

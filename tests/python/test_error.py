@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from conftest import SyntheticRender
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, Halves
 from tungsten_dip.fit import FitSettings, denoise
-from tungsten_dip.fit.output.error import crossed_errors, estimate_error, held_out_error
+from tungsten_dip.fit.candidates import Candidates
+from tungsten_dip.fit.scoring.estimate import crossed_errors, estimate_error, held_out_error
 
 PIXELS = 10_000
 TRUTH = 1.0
@@ -26,32 +29,33 @@ def _noisy(sigma: float, seed: int) -> Halves:
     return a, b
 
 
-def _mean_estimate(pilots: list[Halves], denoised: Halves) -> float:
-    errors: FloatArray = estimate_error(pilots, 1.0, denoised)
+def _mean_estimate(noisy: Halves, apart: Sequence[float], denoised: Halves) -> float:
+    """Return the mean error, with pilots that are so far from the truth."""
+    pilots = tuple(_constant(TRUTH + distance) for distance in apart)
+    errors: FloatArray = estimate_error(Candidates(noisy, pilots), 1.0, denoised)
     assert errors.shape == (PIXELS,)
     return float(errors.mean(dtype=np.float64))
 
 
 def test_where_the_noisy_halves_tell_nothing_the_bias_is_between_variance_and_spread_of_pilots() -> None:
-    pilots = [_noisy(30, seed=0), *(_constant(TRUTH + apart) for apart in (0.1, -0.2, 0.3))]
     denoised = _constant(TRUTH + 0.05)[0], _constant(TRUTH - 0.05)[0]
     expected = (0.05**2 + 2.4 * 0.05 * 0.2) * RELATIVE
-    assert _mean_estimate(pilots, denoised) == pytest.approx(expected, rel=1e-3)
+    estimate = _mean_estimate(_noisy(30, seed=0), (0.1, -0.2, 0.3), denoised)
+    assert estimate == pytest.approx(expected, rel=1e-3)
 
 
 def test_pilots_that_blur_prove_no_bias_that_the_halves_deny() -> None:
     """The true error is next to nothing: no more than some standard errors of the halves' may be claimed."""
     sigma = 0.1
-    pilots = [_noisy(sigma, seed=1), *(_constant(TRUTH + 0.5) for _ in range(3))]
     denoised = _constant(TRUTH + 0.001)[0], _constant(TRUTH - 0.001)[0]
     standard_error = sigma**2 / np.sqrt(3 * PIXELS) * RELATIVE
-    assert 0 < _mean_estimate(pilots, denoised) < 8 * standard_error
+    assert 0 < _mean_estimate(_noisy(sigma, seed=1), (0.5, 0.5, 0.5), denoised) < 8 * standard_error
 
 
 def test_what_the_halves_tell_contains_the_variance() -> None:
-    pilots = [_noisy(0.05, seed=2), *(_constant(TRUTH + 0.5) for _ in range(3))]
     sigma = 0.1
-    assert _mean_estimate(pilots, _noisy(sigma, seed=3)) == pytest.approx(sigma**2 / 2 * RELATIVE, rel=0.1)
+    estimate = _mean_estimate(_noisy(0.05, seed=2), (0.5, 0.5, 0.5), _noisy(sigma, seed=3))
+    assert estimate == pytest.approx(sigma**2 / 2 * RELATIVE, rel=0.1)
 
 
 @pytest.mark.parametrize(("sigma", "bias"), [(0.1, 0.2), (2, 0.2), (30, 0.2)])
@@ -60,7 +64,7 @@ def test_the_held_out_error_is_told_by_the_halves_or_where_they_are_too_noisy_by
 ) -> None:
     """Of the two, the other one would be far off."""
     smallest = _constant(TRUTH) if sigma > 1 else _constant(TRUTH + 5)
-    error = held_out_error([_noisy(sigma, seed=4), smallest], _constant(TRUTH + bias))
+    error = held_out_error(Candidates(_noisy(sigma, seed=4), (smallest,)), _constant(TRUTH + bias))
     assert error == pytest.approx(bias**2 / ((TRUTH + bias) ** 2 + 0.01), rel=0.05)
 
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from conftest import MakeRender
-from tungsten_dip.buffers.render_buffers import Buffer, Halves, RenderBuffers
+from fitted_models import evidence_of
+from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence
-from tungsten_dip.fit.evidence import Evidence
-from tungsten_dip.fit.network import training
+from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.network.inputs import loss_weights
-from tungsten_dip.fit.network.scoring import ErrorMeasure, _caps, _denominators
 from tungsten_dip.fit.output import all_samples
 from tungsten_dip.fit.pilots.maker import PilotMaker
 from tungsten_dip.fit.preparation.exposure import unscaled
+from tungsten_dip.fit.presets import DRAFT_PILOTS
+from tungsten_dip.fit.scoring.measure import ErrorMeasure, _caps, _denominators
 
 
 def test_guides_are_as_noisy_as_is_said_of_them(
@@ -41,21 +42,13 @@ def test_guides_are_as_noisy_as_is_said_of_them(
         assert said == pytest.approx(true, rel=0.3)
 
 
-def test_pixels_count_less_where_the_noise_is_heavy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_count_less_where_the_noise_is_heavy() -> None:
     """On the left a relative variance of 0.01, on the right of 9: one part in 1 + 9 of the weight."""
     shape = np.where(np.arange(80) < 40, 100, 1 / 9)[None, :, None] * np.ones((40, 1, 3))
     rng = np.random.default_rng(0)
     a, b = (rng.gamma(shape, 1 / shape).astype(np.float32) for _ in range(2))
-    weights: list[Halves] = []
-
-    def recorded(known: Evidence) -> Halves:
-        weights.append(loss_weights(known))
-        return weights[-1]
-
-    monkeypatch.setattr(training, "loss_weights", recorded)
-    denoise(RenderBuffers(Buffer((a + b) / 2, a, b)), FitSettings("draft", iterations=1, threads=1))
-    ((of_a, of_b),) = weights
-    for weight in (of_a, of_b):
+    _, cues = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), DRAFT_PILOTS)
+    for weight in loss_weights(cues):
         calm, heavy = np.median(weight[:, 4:30]), np.median(weight[:, 50:-4])
         assert 0.03 < heavy / calm < 0.3
 
@@ -72,7 +65,7 @@ def test_errors_are_relative_to_the_darker_of_the_last_pilot_and_the_median_one(
 def test_one_outlier_is_a_small_part_of_the_error_around_it() -> None:
     """It counts as 20 times the mean error of a half by itself in the 17x17 pixels around."""
     noisy, flat = np.ones((40, 40, 3), np.float32), np.zeros((40, 40, 3), np.float32)
-    candidates, ones = ((noisy, 2 * noisy), (flat, flat)), np.ones((40, 40, 1), np.float32)
+    candidates, ones = Candidates((noisy, 2 * noisy), ((flat, flat),)), np.ones((40, 40, 1), np.float32)
     caps = _caps(candidates, (ones, ones), 1)
     np.testing.assert_allclose(caps[0], 20, rtol=1e-3)
     np.testing.assert_allclose(caps[1], 80, rtol=1e-3)

@@ -21,15 +21,15 @@ from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, blending, denoise
 from tungsten_dip.fit.blending import fit_blend
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.network import training
 from tungsten_dip.fit.network.blend_network import Examples
-from tungsten_dip.fit.network.layout import Pilot
 from tungsten_dip.fit.network.training import Training, _batches
 from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
 from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
-from tungsten_dip.fit.pilots.presets import BALANCED_PILOTS, DRAFT_PILOTS
-from tungsten_dip.fit.pilots.surfaces import Surfaces, surfaces_of_halves
+from tungsten_dip.fit.pilots.surfaces import Surfaces, surfaces_of_colors
 from tungsten_dip.fit.preparation.prepare import prepare_input
+from tungsten_dip.fit.presets import BALANCED_PILOTS, DRAFT_PILOTS
 from tungsten_dip.progress import silent
 
 
@@ -379,10 +379,9 @@ def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
 ) -> None:
     told = []
 
-    def until_given_up(*arguments: Any) -> tuple[FloatImage, ...]:
-        *before, given_up = arguments
-        told.append(given_up.wait(timeout=60))
-        made = pilots_of_all_samples(*before, given_up)
+    def until_given_up(*arguments: Any, **options: Any) -> tuple[FloatImage, ...]:
+        told.append(options["given_up"].wait(timeout=60))
+        made = pilots_of_all_samples(*arguments, **options)
         assert made == ()
         return made
 
@@ -434,13 +433,13 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
             signal.raise_signal(signal.SIGINT)
         return wait(*arguments, **options)
 
-    def after_training(*arguments: Any) -> tuple[FloatImage, ...]:
+    def after_training(*arguments: Any, **options: Any) -> tuple[FloatImage, ...]:
         told.append(waiting.wait(timeout=60))
         if waits:
             # Python raises it in the main thread, which waits for this one.
             signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
-        told.append(arguments[-1].wait(timeout=60))
-        return pilots_of_all_samples(*arguments)
+        told.append(options["given_up"].wait(timeout=60))
+        return pilots_of_all_samples(*arguments, **options)
 
     monkeypatch.setattr(interrupts, "wait", wait_or_interrupt)
     monkeypatch.setattr(blending, "pilots_of_all_samples", after_training)
@@ -475,7 +474,7 @@ def test_a_failure_beside_the_training_is_raised_when_it_is_waited_for(
 ) -> None:
     trained = []
 
-    def fail(*_: Any) -> tuple[FloatImage, ...]:
+    def fail(*_: Any, **options: Any) -> tuple[FloatImage, ...]:
         raise InputError("a test's")
 
     def recorded(*arguments: Any) -> Training:
@@ -496,8 +495,8 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
     def fail(*_: Any) -> Training:
         raise InputError("a test's")
 
-    def until_given_up(*arguments: Any) -> tuple[FloatImage, ...]:
-        assert threads == 1 or arguments[-1].wait(timeout=60)
+    def until_given_up(*_: Any, given_up: Event, **options: Any) -> tuple[FloatImage, ...]:
+        assert threads == 1 or given_up.wait(timeout=60)
         return ()
 
     monkeypatch.setattr(blending, "train", fail)
@@ -537,7 +536,7 @@ def _surfaces(buffers: RenderBuffers) -> tuple[Surfaces, ...]:
     half_a, half_b = buffers.color.half_a, buffers.color.half_b
     assert half_a is not None
     assert half_b is not None
-    return surfaces_of_halves(buffers, (half_a, half_b), 1.0, 1)
+    return surfaces_of_colors(buffers, (half_a, half_b), 1.0, 1)
 
 
 def test_constant_features_do_not_reach_the_regression(render: SyntheticRender) -> None:
@@ -593,7 +592,7 @@ def test_a_pilot_of_the_color_does_without_features(render: SyntheticRender) -> 
         assert color.half_a is not None
         assert color.half_b is not None
         halves, surfaces = (color.half_a, color.half_b), _surfaces(buffers)
-        return PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(pilot)
+        return PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(pilot)
 
     features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
     noisy = render.buffers.with_quantities(**features)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fitted_models import DRAFT, evidence_of
+from fitted_models import evidence_of
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
-from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.output.denoised import denoised_image
 from tungsten_dip.fit.output.lost_detail import with_lost_detail
 
@@ -45,9 +44,9 @@ def test_all_samples_keep_what_is_given_back() -> None:
     truth = np.full(SHAPE, 0.2, np.float32)
     truth[10:13, 20:24] = 1.6
     a, b = _halves(truth, 32.0)
-    evidence = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
+    evidence, _ = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
     flat = np.full(SHAPE, 0.2 * evidence.scale, np.float32)
-    result = denoised_image(evidence, (flat, flat), flat, DRAFT, Clock())
+    result = denoised_image(evidence, (flat, flat), flat)
     assert not any("is returned" in note for note in result.notes)
     assert result.color[10:13, 20:24].mean() > 1.4
     np.testing.assert_allclose(result.color, (result.halves[0] + result.halves[1]) / 2, rtol=1e-6)
@@ -57,10 +56,10 @@ def test_all_samples_make_nothing_negative_of_what_is_given_back_to_the_dark() -
     truth = np.full(SHAPE, 0.2, np.float32)
     truth[10:20, 20:34] = 0.01
     a, b = _halves(truth, 32.0)
-    evidence = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
+    evidence, _ = evidence_of(RenderBuffers(Buffer((a + b) / 2, a, b)), (Pilot("features", 1),))
     darker, brighter = (np.full(SHAPE, level * evidence.scale, np.float32) for level in (0.16, 0.24))
     dark = np.full(SHAPE, 0.02 * evidence.scale, np.float32)
-    result = denoised_image(evidence, (darker, brighter), dark, DRAFT, Clock())
+    result = denoised_image(evidence, (darker, brighter), dark)
     assert not any("is returned" in note for note in result.notes)
     assert result.color[10:20, 20:34].mean() < 0.1
     assert result.color.min() >= 0

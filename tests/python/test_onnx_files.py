@@ -11,10 +11,10 @@ from hypothesis import given, settings, strategies
 
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.network.blend_network import first_weights
-from tungsten_dip.fit.network.layout import Layout, Pilot
-from tungsten_dip.fit.network.standardisation import Standardisation
+from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.onnx.file import proto_from_model

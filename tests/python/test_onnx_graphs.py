@@ -18,10 +18,10 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, inference
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.network.blend_network import Examples, first_weights
-from tungsten_dip.fit.network.layout import Layout, Pilot
-from tungsten_dip.fit.network.standardisation import Standardisation
+from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import infer
 from tungsten_dip.onnx.file import proto_from_model
 from tungsten_dip.progress import silent

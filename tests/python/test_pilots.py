@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.fit.network.layout import Pilot
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
-from tungsten_dip.fit.pilots.surfaces import Surfaces, divisor, surfaces_of_halves
+from tungsten_dip.fit.pilots.surfaces import Surfaces, divisor, surfaces_of_colors
 
 Plane = np.ndarray
 
@@ -34,7 +34,7 @@ def _surfaces(
     albedo = [_rgb(np.where(light > 0, 1 + light, wall)) for light in emitted]
     color_a, color_b = (_rgb(0.3 + light) for light in seen or emitted)
     buffers = RenderBuffers(_buffer(color_a, color_b), albedo=_buffer(*albedo))
-    return surfaces_of_halves(buffers, (color_a, color_b), 1.0, 1)
+    return surfaces_of_colors(buffers, (color_a, color_b), 1.0, 1)
 
 
 @pytest.mark.parametrize("pixel", [(8, 9), (0, 9), (0, 0)])
@@ -111,8 +111,8 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     surface = (columns >= 16) & (columns < 32)
     halves = _noisy(np.where(surface, 0.03, 0), shape=0.2)
     depth = Buffer(np.where(surface, 2, 0)[:, :, None].astype(np.float32))
-    surfaces = surfaces_of_halves(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
-    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces)).images(
+    surfaces = surfaces_of_colors(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
+    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(
         Pilot("guided", 6, step=2, k=1.0)
     ):
         assert image[surface].mean() == pytest.approx(0.03, rel=0.1)
@@ -123,8 +123,8 @@ def test_the_previous_frame_guides_pilots_of_the_color() -> None:
     """It shows stripes of shadow that the noise hides."""
     truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
     halves, previous = _noisy(truth, shape=0.5), (_rgb(truth), _rgb(truth))
-    surfaces = surfaces_of_halves(RenderBuffers(_buffer(*halves)), halves, 1.0, 1)
-    alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces))
+    surfaces = surfaces_of_colors(RenderBuffers(_buffer(*halves)), halves, 1.0, 1)
+    alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1)
     guided = replace(alone, previous=previous)
     errors = [
         np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - _rgb(truth)) ** 2) for maker in (alone, guided)

@@ -16,7 +16,7 @@ from tungsten_dip.buffers.source import Part
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.network import blend_network, training
-from tungsten_dip.fit.pilots.presets import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
+from tungsten_dip.fit.presets import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera

@@ -2,42 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 import pytest
 
 from conftest import MakeRender, SyntheticRender
-from tungsten_dip.buffers.render_buffers import Indices
+from fitted_models import evidence_of
 from tungsten_dip.fit import FitSettings, blending, denoise
-from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.network import training
 from tungsten_dip.fit.network.blend_network import HIDDEN, BlendNetwork, Examples
-from tungsten_dip.fit.network.training import LEARNING_RATE
+from tungsten_dip.fit.network.training import LEARNING_RATE, start_of_training
+from tungsten_dip.fit.presets import DRAFT_PILOTS
 from tungsten_dip.fit.settings import Preset
 
 
-def test_the_pixels_that_tell_the_error_are_not_trained_on(
-    render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    probed, trained = [], []
-    candidates_at, batches = Evidence.candidates_at, training._batches
-
-    def probed_at(evidence: Evidence, pixels: Indices) -> Any:
-        probed.append(pixels)
-        return candidates_at(evidence, pixels)
-
-    def batches_of(examples: Examples, pixels: Indices, *rest: Any) -> Iterator[Examples]:
-        trained.append(pixels)
-        return batches(examples, pixels, *rest)
-
-    monkeypatch.setattr(Evidence, "candidates_at", probed_at)
-    monkeypatch.setattr(training, "_batches", batches_of)
-    denoise(render.buffers, FitSettings("draft", iterations=1, threads=1))
-    assert len(probed) == len(trained) == 1
-    assert len(probed[0]) == 40 * 56 // 8
-    assert sorted([*probed[0], *trained[0]]) == list(range(40 * 56))
+def test_the_pixels_that_tell_the_error_are_not_trained_on(render: SyntheticRender) -> None:
+    evidence, cues = evidence_of(render.buffers, DRAFT_PILOTS)
+    start = start_of_training(evidence, cues, 0, None, 1)
+    probe, trained = training._probe(start, np.random.default_rng(0))
+    half_a = start.evidence.candidates.noisy[0].reshape(-1, 3)
+    told = probe.candidates.noisy[0]
+    assert len(told) == 40 * 56 // 8
+    both = np.concatenate((told, half_a[trained]))
+    np.testing.assert_array_equal(np.sort(both, axis=0), np.sort(half_a, axis=0))
 
 
 class _Clock:

@@ -11,9 +11,10 @@ import pytest
 
 from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
-from tungsten_dip.buffers.render_buffers import FloatArray
+from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage
 from tungsten_dip.fit import denoise
-from tungsten_dip.fit.evidence import with_best_baseline
+from tungsten_dip.fit.evidence import Cues, Evidence, with_best_baseline
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.network.blend_network import (
     BlendNetwork,
@@ -23,7 +24,6 @@ from tungsten_dip.fit.network.blend_network import (
     weight_shapes,
 )
 from tungsten_dip.fit.network.inputs import INPUTS_RADIUS, inputs_of_half, loss_weights, network_inputs
-from tungsten_dip.fit.network.layout import Layout, Pilot
 from tungsten_dip.fit.network.training import start_of_training
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx import infer
@@ -32,12 +32,12 @@ torch = pytest.importorskip("torch")
 
 from torch_network import TorchNetwork  # noqa: E402
 
+PILOTS = (Pilot("features", 1), Pilot("features", 3))
+
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
-    evidence = evidence_of(
-        synthetic_render(24, 20, seed=seed).buffers, (Pilot("features", 1), Pilot("features", 3))
-    )
-    return start_of_training(evidence, seed, None, 1).examples, evidence.layout
+    evidence, cues = evidence_of(synthetic_render(24, 20, seed=seed).buffers, PILOTS)
+    return start_of_training(evidence, cues, seed, None, 1).examples, evidence.layout
 
 
 @pytest.mark.parametrize("pixels", [1, 37, 480])
@@ -154,44 +154,59 @@ def test_a_refit_does_what_a_warm_start_does(model: Model, next_frame: Synthetic
     np.testing.assert_allclose(again.color, refit.color, rtol=1e-5)
 
 
-def test_evidence_in_bands_is_that_of_the_whole(frame: SyntheticRender) -> None:
-    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
-    whole = network_inputs(evidence).reshape(2, 32, 48, -1)
-    upper = network_inputs(evidence.rows(0, 28)).reshape(2, 28, 48, -1)
-    lower = network_inputs(evidence.rows(4, 32)).reshape(2, 28, 48, -1)
+def test_inputs_in_bands_are_those_of_the_whole(frame: SyntheticRender) -> None:
+    evidence, cues = evidence_of(frame.buffers, PILOTS)
+
+    def of_rows(first: int, end: int) -> FloatArray:
+        inputs = network_inputs(
+            evidence.layout, evidence.candidates.rows(first, end), cues.rows(first, end), 1
+        )
+        return inputs.reshape(2, end - first, 48, -1)
+
+    whole, upper, lower = of_rows(0, 32), of_rows(0, 28), of_rows(4, 32)
     inner = 28 - INPUTS_RADIUS
     np.testing.assert_allclose(upper[:, :inner], whole[:, :inner], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(lower[:, -inner:], whole[:, -inner:], rtol=1e-3, atol=1e-3)
 
 
+def _inputs_of_half_a(evidence: Evidence, cues: Cues) -> FloatArray:
+    """Return the inputs of half A, shape (height, width, inputs)."""
+    return np.stack(list(inputs_of_half(evidence.layout, evidence.candidates, cues, 0, 1)), axis=2)
+
+
+def _with_noisy(evidence: Evidence, half_a: FloatImage, half_b: FloatImage) -> Evidence:
+    return replace(evidence, candidates=replace(evidence.candidates, noisy=(half_a, half_b)))
+
+
 def test_the_network_sees_its_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
     """Or it would prefer a noisy pixel for being dark."""
-    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
-    y, x, half = 11, 17, 0
-    noisy = [image.copy() for image in evidence.halves]
-    noisy[half][y, x] *= 3
-    other = replace(evidence, candidates=((noisy[0], noisy[1]), *evidence.candidates[1:]))
-    before, after = (np.stack(list(inputs_of_half(e, half)), axis=2) for e in (evidence, other))
+    evidence, cues = evidence_of(frame.buffers, PILOTS)
+    y, x = 11, 17
+    half_a, half_b = evidence.candidates.noisy
+    changed = half_a.copy()
+    changed[y, x] *= 3
+    before = _inputs_of_half_a(evidence, cues)
+    after = _inputs_of_half_a(_with_noisy(evidence, changed, half_b), cues)
     np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
     assert np.abs(after - before).max() > 0.01
 
 
 def test_the_network_sees_the_scoring_halfs_noise_of_no_pixel_at_that_pixel(frame: SyntheticRender) -> None:
     """Nor may the weight of the pixel in the loss depend on it, or the image would darken."""
-    evidence = evidence_of(frame.buffers, (Pilot("features", 1), Pilot("features", 3)))
-    before = np.stack(list(inputs_of_half(evidence, 0)), axis=2)
+    evidence, cues = evidence_of(frame.buffers, PILOTS)
+    before = _inputs_of_half_a(evidence, cues)
+    half_a, half_b = evidence.candidates.noisy
     largest_change = 0.0
     for y in range(3, 32, 4):
         for x in range(3, 48, 4):
-            noisy = evidence.halves[1].copy()
-            noisy[y, x] = 5 * noisy[y, x] + 0.1
-            changed = replace(evidence, candidates=((evidence.halves[0], noisy), *evidence.candidates[1:]))
+            changed = half_b.copy()
+            changed[y, x] = 5 * changed[y, x] + 0.1
             # As a fit does: the noise is estimated with the same half.
-            changed = with_best_baseline(changed)
-            assert changed.layout == evidence.layout
-            after = np.stack(list(inputs_of_half(changed, 0)), axis=2)
+            other, other_cues = with_best_baseline(_with_noisy(evidence, half_a, changed), cues)
+            assert other.layout == evidence.layout
+            after = _inputs_of_half_a(other, other_cues)
             np.testing.assert_allclose(after[y, x], before[y, x], rtol=1e-3, atol=1e-3)
             largest_change = max(largest_change, float(np.abs(after - before).max()))
-            weights = (loss_weights(e)[0][y, x, 0] for e in (evidence, changed))
+            weights = (loss_weights(c)[0][y, x, 0] for c in (cues, other_cues))
             assert next(weights) == pytest.approx(next(weights), rel=1e-3)
     assert largest_change > 0.1

@@ -12,22 +12,20 @@ from tungsten_dip.buffers.render_buffers import (
     FEATURES,
     FloatImage,
     Halves,
-    Indices,
     RenderBuffers,
     mean_of,
 )
-from tungsten_dip.cores import thread_count
+from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.network.layout import Layout, Pilot
-from tungsten_dip.fit.network.scoring import ErrorMeasure, best_candidate, error_measure
-from tungsten_dip.fit.pilots.maker import Guides, PilotMaker, first_guides, following_guides
+from tungsten_dip.fit.layout import Layout, Pilot
+from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides, following_guides
 from tungsten_dip.fit.pilots.oidn import oidn_pilot
-from tungsten_dip.fit.pilots.presets import DRAFT_PILOTS, FOLLOWING_PILOTS
-from tungsten_dip.fit.pilots.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_halves
+from tungsten_dip.fit.pilots.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_colors
 from tungsten_dip.fit.preparation.exposure import exposure, scaled
 from tungsten_dip.fit.preparation.fireflies import Limited, limit_fireflies
 from tungsten_dip.fit.preparation.splitting import HalvedImage
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.presets import DRAFT_PILOTS, FOLLOWING_PILOTS
+from tungsten_dip.fit.scoring.measure import ErrorMeasure, best_candidate, error_measure
 from tungsten_dip.fit.stages import stage
 from tungsten_dip.progress import Progress
 
@@ -43,81 +41,75 @@ _DRAFT_SHARE = 0.7
 class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``features`` holds those of each half by name, shape
-    (height, width). ``candidates`` holds both halves of the noisy image, of every pilot, of every extra
-    pilot, ``measure`` says how their errors are measured. ``baseline_errors``, shape (height, width, 1), are
-    those of the baseline in the pixels around each. ``guide_variance`` is that of the pilots' guides (see
+    ``mean`` is the noisy image, without fireflies. ``guide_variance`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`). ``halves_drawn``
     and ``notes`` are those of the result (`FitResult`).
     """
 
     scale: float
     mean: FloatImage
-    features: tuple[dict[str, FloatImage], ...]
     layout: Layout
-    candidates: tuple[Halves, ...]
-    measure: ErrorMeasure
-    baseline_errors: Halves
+    candidates: Candidates
     guide_variance: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
     notes: tuple[str, ...]
     threads: int
 
-    @property
-    def halves(self) -> Halves:
-        """The noisy halves."""
-        return self.candidates[0]
 
-    def candidates_at(self, pixels: Indices) -> tuple[Halves, ...]:
-        """Return the candidates at some pixels, shape (pixels, 3)."""
-        return tuple((a.reshape(-1, 3)[pixels], b.reshape(-1, 3)[pixels]) for a, b in self.candidates)
+@dataclass(frozen=True)
+class Cues:
+    """What the inputs of a network and the weights of its loss are computed from, beside the candidates.
 
-    def rows(self, first: int, end: int) -> Evidence:
-        """Return the evidence of some rows alone."""
+    ``features`` holds those of each half by name, shape (height, width), ``measure`` says how the errors of
+    candidates are measured. ``baseline_errors``, shape (height, width, 1), are those of the baseline in the
+    pixels around each.
+    """
 
-        def cut(images: Halves) -> Halves:
-            return images[0][first:end], images[1][first:end]
+    features: tuple[dict[str, FloatImage], dict[str, FloatImage]]
+    measure: ErrorMeasure
+    baseline_errors: Halves
 
-        return replace(
-            self,
-            mean=self.mean[first:end],
-            features=tuple(
-                {name: image[first:end] for name, image in features.items()} for features in self.features
-            ),
-            candidates=tuple(cut(candidate) for candidate in self.candidates),
-            measure=self.measure.rows(first, end),
-            baseline_errors=cut(self.baseline_errors),
-            guide_variance=self.guide_variance[first:end],
-            gain=None if self.gain is None else self.gain[first:end],
+    def rows(self, first: int, end: int) -> Cues:
+        """Return those of some rows alone."""
+        features_a, features_b = (
+            {name: image[first:end] for name, image in features.items()} for features in self.features
+        )
+        errors_a, errors_b = self.baseline_errors
+        return Cues(
+            (features_a, features_b),
+            self.measure.rows(first, end),
+            (errors_a[first:end], errors_b[first:end]),
         )
 
 
 def evidence_from_buffers(
     image: HalvedImage,
-    settings: FitSettings,
     plan: Layout | Sequence[Pilot],
     clock: Clock,
     progress: Progress,
-    previous: Halves | None,
-) -> Evidence:
+    *,
+    threads: int,
+    with_oidn: bool = False,
+    previous: Halves | None = None,
+) -> tuple[Evidence, Cues]:
     """Compute the pilots of an image, as many as the time budget lets begin (one at least).
 
-    ``plan`` is the pilots, or the layout of a fitted network, whose pilots are all computed. ``previous``
-    is an extra pilot, NaN where it has no value, that guides the pilots as well.
+    ``plan`` is the pilots, or the layout of a fitted network, whose pilots are all computed. Extra pilots are
+    the image of Open Image Denoise, if ``with_oidn``, and the ``previous`` frame: halves of a result, NaN
+    where they have no value, that guide the pilots as well.
 
     Raises InputError if the layout has a feature that is missing or another number of extra pilots.
     """
     layout, pilots = (plan, plan.pilots) if isinstance(plan, Layout) else (None, plan)
     buffers = image.buffers
-    threads = thread_count(settings.threads)
     scale = exposure(buffers.color.mean)
-    mean, limited = _without_fireflies(buffers, scale, threads)
+    mean, limited = _without_fireflies(image, scale, threads)
     halves = limited.halves
-    surfaces = surfaces_of_halves(buffers, halves, scale, threads)
+    surfaces = surfaces_of_colors(buffers, halves, scale, threads)
     stage(progress, "features")(1.0, "features")
     extra_pilots: list[Halves] = []
-    if settings.pilot == "oidn":
+    if with_oidn:
         a, b = oidn_pilot(buffers, halves, scale, threads)
         extra_pilots.append((a, b))
         stage(progress, "extra pilots")(1.0, "Open Image Denoise")
@@ -126,49 +118,44 @@ def evidence_from_buffers(
         layout.check_fits(features_there, len(extra_pilots) + (previous is not None))
 
     occupied = occupied_pixels(halves, buffers, threads)
-    guides, already_computed, filled = _guides(halves, surfaces, previous, scale, occupied)
-    maker = PilotMaker(halves, surfaces, guides, previous=filled)
+    filled = None
+    already_computed: dict[Pilot, Halves] = {}
+    if previous is None:
+        guides = first_guides(halves, surfaces, threads)
+    else:
+        guides, filler, filled = following_guides(
+            halves, _scaled_halves(previous, scale), surfaces, FOLLOWING_PILOTS[0], threads
+        )
+        already_computed = {FOLLOWING_PILOTS[0]: _masked(filler, occupied)}
+        filled = _masked(filled, occupied)
+        extra_pilots.append(filled)
+    maker = PilotMaker(halves, surfaces, guides, threads, previous=filled)
     budget = clock if layout is None else Clock()
     computed = _computed(maker, pilots, already_computed, occupied, budget, stage(progress, "pilots"))
-    if filled is not None:
-        extra_pilots.append(filled)
 
-    candidates = (halves, *computed, *extra_pilots)
-    measure = error_measure(candidates, computed, threads)
+    candidates = Candidates(halves, tuple(computed), tuple(extra_pilots))
+    measure = error_measure(candidates, threads)
     if layout is None:
         baseline = best_candidate(candidates, measure)
         layout = Layout(surfaces[0].names, tuple(pilots[: len(computed)]), len(extra_pilots), baseline)
-    baseline_errors = measure.errors_around(candidates[layout.baseline_index], halves, threads)
-    features = tuple({name: _feature(s, name) for name in layout.features} for s in surfaces)
-    notes = (*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes)
-    return Evidence(
+    features_a, features_b = ({name: _feature(s, name) for name in layout.features} for s in surfaces)
+    evidence = Evidence(
         scale=scale,
         mean=mean,
-        features=features,
         layout=layout,
         candidates=candidates,
-        measure=measure,
-        baseline_errors=baseline_errors,
         guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
-        notes=notes,
+        notes=(*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes),
         threads=threads,
     )
-
-
-def _guides(
-    halves: Halves,
-    surfaces: tuple[Surfaces, ...],
-    previous: Halves | None,
-    scale: float,
-    occupied: FloatImage,
-) -> tuple[Guides, dict[Pilot, Halves], Halves | None]:
-    """Return the guides, pilots that are computed along with them, and the previous frame, filled."""
-    if previous is None:
-        return first_guides(halves, surfaces), {}, None
-    guides, first, filled = following_guides(halves, _scaled_halves(previous, scale), surfaces)
-    return guides, {FOLLOWING_PILOTS[0]: _masked(first, occupied)}, _masked(filled, occupied)
+    cues = Cues(
+        (features_a, features_b),
+        measure,
+        measure.errors_around(candidates.all[layout.baseline_index], halves, threads),
+    )
+    return evidence, cues
 
 
 def _computed(
@@ -191,12 +178,11 @@ def _computed(
     return computed
 
 
-def _without_fireflies(buffers: RenderBuffers, scale: float, threads: int) -> tuple[FloatImage, Limited]:
+def _without_fireflies(image: HalvedImage, scale: float, threads: int) -> tuple[FloatImage, Limited]:
     """Return the mean and the halves, scaled, without fireflies."""
-    color = buffers.color
-    assert color.halves is not None
-    half_a, half_b = (scaled(half, scale) for half in color.halves)
-    emission = emission_of_halves(buffers, (half_a, half_b), scale)
+    color = image.buffers.color
+    half_a, half_b = (scaled(half, scale) for half in image.halves)
+    emission = emission_of_halves(image.buffers, (half_a, half_b), scale)
     deviation = None if color.variance is None else scaled(np.sqrt(color.variance), scale)
     limited = limit_fireflies(half_a, half_b, threads, emission, deviation)
     if limited.gain is None:
@@ -215,15 +201,13 @@ def _scaled_halves(halves: Halves, scale: float) -> Halves:
     return a, b
 
 
-def with_best_baseline(evidence: Evidence) -> Evidence:
-    """Return the same evidence with the candidate that is best on this image as the baseline."""
-    candidates, measure = evidence.candidates, evidence.measure
+def with_best_baseline(evidence: Evidence, cues: Cues) -> tuple[Evidence, Cues]:
+    """Return the same with the candidate that is best on this image as the baseline."""
+    candidates, measure = evidence.candidates, cues.measure
     baseline = best_candidate(candidates, measure)
-    return replace(
-        evidence,
-        layout=replace(evidence.layout, baseline_index=baseline),
-        baseline_errors=measure.errors_around(candidates[baseline], evidence.halves, evidence.threads),
-    )
+    errors = measure.errors_around(candidates.all[baseline], candidates.noisy, evidence.threads)
+    layout = replace(evidence.layout, baseline_index=baseline)
+    return replace(evidence, layout=layout), replace(cues, baseline_errors=errors)
 
 
 def _feature(surfaces: Surfaces, name: str) -> FloatImage:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.render_buffers import FloatArray, RenderBuffers
 from tungsten_dip.errors import InputError
-from tungsten_dip.fit.network.layout import Layout
-from tungsten_dip.fit.network.standardisation import Standardisation
+from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.settings import NETWORK_SETTINGS, PAPER_SETTINGS, FitSettings
+from tungsten_dip.fit.standardisation import Standardisation
 
 Weights = dict[str, npt.NDArray[np.float32]]
 """Weights by name. Those of convolutions have shape (outputs, inputs, height, width)."""

@@ -19,6 +19,18 @@ class HistoryPoint:
 
 
 @dataclass(frozen=True, eq=False)
+class DenoisedImage:
+    """The part of a `FitResult` that is made of images."""
+
+    color: FloatImage
+    halves: Halves
+    error: FloatImage
+    estimated_relmse: float
+    gain: FloatImage | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class FitResult:
     """A denoised image, its estimated error, and the fitted network.
 

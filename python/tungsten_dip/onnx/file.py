@@ -24,10 +24,10 @@ from onnx import TensorProto, numpy_helper
 
 from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError, check_type
+from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
-from tungsten_dip.fit.network.layout import Layout, Pilot
-from tungsten_dip.fit.network.standardisation import Standardisation
 from tungsten_dip.fit.settings import NETWORK_SETTINGS, FitSettings
+from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx.graph import graph_of
 
 LARGEST_FILE_BYTES = 64 << 20

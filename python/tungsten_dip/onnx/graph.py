@@ -17,7 +17,6 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit.model import Model, Weights
 from tungsten_dip.fit.network.blend_network import HIDDEN, members_of
 from tungsten_dip.fit.network.blend_network import LEAKY_SLOPE as BLEND_SLOPE
-from tungsten_dip.fit.network.standardisation import LARGEST_INPUT
 from tungsten_dip.fit.paper.constants import (
     LEAKY_SLOPE,
     NORM_EPSILON,
@@ -26,6 +25,7 @@ from tungsten_dip.fit.paper.constants import (
     SIDE_CHANNELS,
     SIDE_SCALES,
 )
+from tungsten_dip.fit.standardisation import LARGEST_INPUT
 from tungsten_dip.graphs.builder import GraphBuilder
 
 _MOST_MEMBERS = 16

@@ -12,7 +12,7 @@ import numpy as np
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
-from tungsten_dip.fit.output.error import crossed_errors, is_sure, mean_and_standard_error
+from tungsten_dip.fit.scoring.estimate import crossed_errors, is_sure, mean_and_standard_error
 
 
 def flicker(

@@ -19,11 +19,12 @@ from tungsten_dip.buffers.render_buffers import FEATURES, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
-from tungsten_dip.fit.blending import STEPS_OF_ONE_NETWORK, fit_blend
+from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
 from tungsten_dip.fit.model import Model
 from tungsten_dip.fit.pilots.surfaces import alpha_as_albedo
 from tungsten_dip.fit.preparation.prepare import finish_result, prepare_input
+from tungsten_dip.fit.presets import STEPS_OF_ONE_NETWORK
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.progress import Progress, silent

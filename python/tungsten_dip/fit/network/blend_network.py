@@ -20,8 +20,8 @@ import onnx
 
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Indices
 from tungsten_dip.cores import in_parallel
+from tungsten_dip.fit.layout import Layout
 from tungsten_dip.fit.model import Weights, check_finite
-from tungsten_dip.fit.network.layout import Layout
 from tungsten_dip.graphs.builder import GraphBuilder
 from tungsten_dip.graphs.sessions import Device, session_from_proto
 

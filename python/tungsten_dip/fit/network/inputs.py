@@ -15,9 +15,10 @@ import numpy as np
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage, Halves
 from tungsten_dip.cores import in_pair
-from tungsten_dip.fit.evidence import Evidence
+from tungsten_dip.fit.candidates import Candidates
+from tungsten_dip.fit.evidence import Cues
+from tungsten_dip.fit.layout import SCORE_RADII, Layout
 from tungsten_dip.fit.neighbours import mean_around, signed_mean_around
-from tungsten_dip.fit.network.layout import SCORE_RADII
 
 INPUTS_RADIUS = max(SCORE_RADII)
 
@@ -42,7 +43,7 @@ _LEAST_NOISE = 1.0
 """Relative variance of one half's pixel below which less noise does not make a pixel count more."""
 
 
-def loss_weights(evidence: Evidence) -> Halves:
+def loss_weights(cues: Cues) -> Halves:
     """Return how much the squared error of each half's pixels counts, shape (height, width, 1).
 
     Relative to pilots of the half itself, never to the half that scores it: a pixel must not count less
@@ -51,54 +52,55 @@ def loss_weights(evidence: Evidence) -> Halves:
     with np.errstate(over="ignore"):  # What is too noisy for a float32 counts for nothing.
         weight_a, weight_b = (
             np.reciprocal(d * (np.float32(_LEAST_NOISE) + error))
-            for d, error in zip(evidence.measure.denominators, evidence.baseline_errors, strict=True)
+            for d, error in zip(cues.measure.denominators, cues.baseline_errors, strict=True)
         )
     return weight_a, weight_b
 
 
-def inputs_of_half(evidence: Evidence, half: int) -> Iterator[FloatImage]:
+def inputs_of_half(
+    layout: Layout, candidates: Candidates, cues: Cues, half: int, threads: int
+) -> Iterator[FloatImage]:
     """Yield the network's inputs for one half, one after the other, each of shape (height, width).
 
     A pixel's values come from the pixels up to `INPUTS_RADIUS` around it.
     """
-    # The other half is at work beside this one.
-    threads, layout = max(evidence.threads // 2, 1), evidence.layout
     for name in layout.features:
-        yield evidence.features[half][name]
-    around = evidence.baseline_errors[half]
+        yield cues.features[half][name]
+    around = cues.baseline_errors[half]
     yield np.log(around + np.float32(_LEAST_ERROR))[:, :, 0]
-    baseline = evidence.candidates[layout.baseline_index][half]
+    images = candidates.of_half(half)
+    baseline = images[layout.baseline_index]
     base = _log_level(baseline)
     yield base[:, :, 0]
 
-    other = evidence.halves[1 - half]
+    other = candidates.noisy[1 - half]
     unit = np.float32(_SCORE_UNIT) * around + np.float32(_LEAST_ERROR)
-    baseline_error = evidence.measure.error(half, baseline, other)
-    for index, candidate in enumerate(evidence.candidates):
+    baseline_error = cues.measure.error(half, baseline, other)
+    for index, image in enumerate(images):
         if index == layout.baseline_index:
             continue
-        image = candidate[half]
-        if index == 0:
-            # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
-            image = mean_around(image, 1, threads)
-        yield np.clip(_log_level(image) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
-        worse = evidence.measure.error(half, candidate[half], other) - baseline_error
+        # Without the pixel's own noise: else a noisy pixel is preferred for being dark by chance.
+        seen = mean_around(image, 1, threads) if index == 0 else image
+        yield np.clip(_log_level(seen) - base, -_LARGEST_BRIGHTNESS, _LARGEST_BRIGHTNESS)[:, :, 0]
+        worse = cues.measure.error(half, image, other) - baseline_error
         for radius in SCORE_RADII:
             score = signed_mean_around(worse, radius, threads) / unit
             yield np.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)[:, :, 0]
 
 
-def network_inputs(evidence: Evidence) -> FloatArray:
+def network_inputs(layout: Layout, candidates: Candidates, cues: Cues, threads: int) -> FloatArray:
     """Return the inputs of both halves, shape (2, height * width, inputs)."""
-    height, width = evidence.halves[0].shape[:2]
+    height, width = candidates.noisy[0].shape[:2]
     # Filled one input at a time: this is the largest array of a fit.
-    inputs = np.empty((2, height * width, len(evidence.layout.inputs)), np.float32)
+    inputs = np.empty((2, height * width, len(layout.inputs)), np.float32)
 
     def fill(half: int) -> None:
-        for column, image in zip(inputs[half].T, inputs_of_half(evidence, half), strict=True):
+        # The other half is at work beside this one.
+        images = inputs_of_half(layout, candidates, cues, half, max(threads // 2, 1))
+        for column, image in zip(inputs[half].T, images, strict=True):
             column[:] = image.ravel()
 
-    in_pair(fill, evidence.threads)
+    in_pair(fill, threads)
     return inputs
 
 

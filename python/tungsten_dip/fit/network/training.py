@@ -8,20 +8,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tungsten_dip.buffers.render_buffers import FloatArray, Halves, Indices
+from tungsten_dip.buffers.render_buffers import FloatArray, Indices
 from tungsten_dip.cores import in_pair
+from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
-from tungsten_dip.fit.evidence import Evidence, with_best_baseline
+from tungsten_dip.fit.evidence import Cues, Evidence, with_best_baseline
 from tungsten_dip.fit.model import Blend, Model, Weights
 from tungsten_dip.fit.network.blend_network import BlendNetwork, Examples, first_weights
-from tungsten_dip.fit.network.inputs import (
-    loss_weights,
-    network_inputs,
-)
-from tungsten_dip.fit.network.standardisation import LARGEST_INPUT, standardisation_of
-from tungsten_dip.fit.output.error import estimate_error, held_out_error
+from tungsten_dip.fit.network.inputs import loss_weights, network_inputs
 from tungsten_dip.fit.result import HistoryPoint
+from tungsten_dip.fit.scoring.estimate import estimate_error, held_out_error
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.standardisation import LARGEST_INPUT, standardisation_of
 from tungsten_dip.progress import Progress
 
 LEARNING_RATE = 1e-2
@@ -68,53 +66,55 @@ class Start:
     notes: tuple[str, ...] = ()
 
 
-def start_of_training(evidence: Evidence, seed: int, model: Model | None, members: int) -> Start:
+def start_of_training(evidence: Evidence, cues: Cues, seed: int, model: Model | None, members: int) -> Start:
     """Return the examples, and the weights of ``model`` or, if its image was too different, new ones.
 
     New weights are those of so many ``members`` (`fit.network.blend_network`).
     """
-    inputs = network_inputs(evidence)
+    inputs = network_inputs(evidence.layout, evidence.candidates, cues, evidence.threads)
     notes: tuple[str, ...] = ()
     if model is not None and model.blend is not None:
         model.blend.standardisation.apply(inputs, evidence.threads)
         far_out = [float((np.abs(image) >= LARGEST_INPUT).mean()) for image in np.moveaxis(inputs, 2, 0)]
         if max(far_out) <= _STRANGE:
-            return _start(evidence, inputs, model.blend, model.weights, warm=True)
+            return _start(evidence, cues, inputs, model.blend, model.weights, warm=True)
         notes = ("the image is too unlike the model's: a new network is fitted",)
-        evidence = with_best_baseline(evidence)
-        inputs = network_inputs(evidence)
+        evidence, cues = with_best_baseline(evidence, cues)
+        inputs = network_inputs(evidence.layout, evidence.candidates, cues, evidence.threads)
     standardisation = standardisation_of(inputs, evidence.threads)
     standardisation.apply(inputs, evidence.threads)
     weights = first_weights(evidence.layout, seed, members)
     blend = Blend(evidence.layout, standardisation)
-    return _start(evidence, inputs, blend, weights, warm=False, notes=notes)
+    return _start(evidence, cues, inputs, blend, weights, warm=False, notes=notes)
 
 
 def _start(
     evidence: Evidence,
+    cues: Cues,
     inputs: FloatArray,
     blend: Blend,
     weights: Weights,
     warm: bool,
     notes: tuple[str, ...] = (),
 ) -> Start:
-    """Return the start with its examples; its evidence holds no second copy of what they hold."""
+    """Return the start with its examples, of which the candidates of its evidence are views."""
     pixels = inputs.shape[1]
-    candidates = np.empty((2, pixels, len(evidence.candidates), 3), np.float32)
+    candidates = np.empty((2, pixels, len(evidence.candidates.all), 3), np.float32)
 
     def fill(half: int) -> None:
-        for index, candidate in enumerate(evidence.candidates):
-            candidates[half, :, index] = candidate[half].reshape(pixels, 3)
+        for index, image in enumerate(evidence.candidates.of_half(half)):
+            candidates[half, :, index] = image.reshape(pixels, 3)
 
     in_pair(fill, evidence.threads)
-    target = np.concatenate([half.reshape(pixels, 3) for half in evidence.halves[::-1]])
-    weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(evidence)])
+    target = np.concatenate([half.reshape(pixels, 3) for half in evidence.candidates.noisy[::-1]])
+    weight = np.concatenate([weight.reshape(pixels, 1) for weight in loss_weights(cues)])
+    examples = Examples(inputs.reshape(2 * pixels, -1), candidates.reshape(2 * pixels, -1, 3), target, weight)
     # Large images need gigabytes for each copy.
     shape = evidence.mean.shape
-    views = tuple((a.reshape(shape), b.reshape(shape)) for a, b in candidates.transpose(2, 0, 1, 3))
-    examples = Examples(inputs.reshape(2 * pixels, -1), candidates.reshape(2 * pixels, -1, 3), target, weight)
-    evidence = replace(evidence, candidates=views, features=({}, {}))
-    return Start(evidence, examples, blend, weights, warm, notes)
+    noisy, *filtered = [(a.reshape(shape), b.reshape(shape)) for a, b in candidates.transpose(2, 0, 1, 3)]
+    count = len(evidence.candidates.pilots)
+    views = Candidates(noisy, tuple(filtered[:count]), tuple(filtered[count:]))
+    return Start(replace(evidence, candidates=views), examples, blend, weights, warm, notes)
 
 
 def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Generator) -> Iterator[Examples]:
@@ -137,7 +137,7 @@ def _batches(examples: Examples, trained: Indices, size: int, rng: np.random.Gen
 class _Probe:
     """Pixels by which a training is judged: the candidates there, and the examples of each half."""
 
-    candidates: tuple[Halves, ...]
+    candidates: Candidates
     examples: tuple[Examples, Examples]
     scale: float
     threads: int
@@ -146,9 +146,7 @@ class _Probe:
         """Return the estimated error, and the error on the other half."""
 
         def of_half(half: int) -> FloatArray:
-            return network.blend(
-                self.examples[half].inputs, [candidate[half] for candidate in self.candidates]
-            )
+            return network.blend(self.examples[half].inputs, self.candidates.of_half(half))
 
         denoised = in_pair(of_half, self.threads)
         errors = estimate_error(self.candidates, self.scale, denoised)
@@ -163,7 +161,8 @@ def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
     probe, trained = (order[:probed], order[probed:]) if probed else (order, order)
     evidence, examples = start.evidence, start.examples
     of_halves = examples.of_half(0).at(probe), examples.of_half(1).at(probe)
-    return _Probe(evidence.candidates_at(probe), of_halves, evidence.scale, evidence.threads), trained
+    candidates = evidence.candidates.map(lambda image: image.reshape(-1, 3)[probe])
+    return _Probe(candidates, of_halves, evidence.scale, evidence.threads), trained
 
 
 @dataclass

@@ -14,13 +14,18 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import (
+    FloatImage,
+    Halves,
+    RenderBuffers,
+    mean_of,
+    variance_of_mean,
+)
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import PILOTS_SHARE, Evidence, occupied_pixels
 from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
 from tungsten_dip.fit.pilots.oidn import oidn_pilot
-from tungsten_dip.fit.pilots.surfaces import surfaces_of_halves
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.pilots.surfaces import surfaces_of_colors
 
 _SPREAD_RADIUS = 3
 _AGREED = 0.25
@@ -30,33 +35,33 @@ _AGREED = 0.25
 def pilots_of_all_samples(
     evidence: Evidence,
     buffers: RenderBuffers,
-    settings: FitSettings,
     clock: Clock,
+    *,
+    with_oidn: bool,
     given_up: Event | None = None,
 ) -> tuple[FloatImage, ...]:
-    """Return the pilots of all samples, with less noisy features and guides than a half's.
+    """Return the noisy image and its pilots, of all samples.
 
-    One image for each of ``evidence.candidates``, in the units of the evidence, shape (height, width, 3).
-    None at all where the pilots of the halves have used up their share of the time budget, or once
+    They correspond to ``evidence.candidates``, in the units of the evidence, shape (height, width, 3). None
+    are returned where the pilots of the halves have used up their share of the time budget, or once
     ``given_up`` is set.
     """
     if clock.share_spent() > PILOTS_SHARE:
         return ()
-    colors = (evidence.mean,)
-    surfaces = surfaces_of_halves(buffers, colors, evidence.scale, evidence.threads)
-    a, b = evidence.halves
-    variance = np.float32(0.25) * (a - b) ** 2
-    guides = first_guides(colors, surfaces, variance)
+    colors, threads, noisy = (evidence.mean,), evidence.threads, evidence.candidates.noisy
+    surfaces = surfaces_of_colors(buffers, colors, evidence.scale, threads)
+    variance = variance_of_mean(noisy)
+    guides = first_guides(colors, surfaces, threads, variance)
     guides = replace(guides, variance=evidence.guide_variance / np.float32(2))
-    maker = PilotMaker(colors, surfaces, guides, variance)
-    occupied = occupied_pixels(evidence.halves, buffers, evidence.threads)
+    maker = PilotMaker(colors, surfaces, guides, threads, variance)
+    occupied = occupied_pixels(noisy, buffers, threads)
     computed = []
     for pilot in evidence.layout.pilots:
         if given_up is not None and given_up.is_set():
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
-    if settings.pilot == "oidn":
-        computed.extend(oidn_pilot(buffers, colors, evidence.scale, evidence.threads))
+    if with_oidn:
+        computed.extend(oidn_pilot(buffers, colors, evidence.scale, threads))
     return (evidence.mean, *computed)
 
 
@@ -66,9 +71,8 @@ def with_all_samples(denoised: Halves, all_samples_blend: FloatImage, threads: i
     All are linear radiance of shape (height, width, 3). The result moves no further than the halves' results
     differ in the surrounding pixels, and less where they differ strongly.
     """
-    a, b = denoised
     image = mean_of(denoised)
-    spread = _core.box_mean(channel_mean(np.float32(0.25) * (a - b) ** 2), _SPREAD_RADIUS, threads)
+    spread = _core.box_mean(channel_mean(variance_of_mean(denoised)), _SPREAD_RADIUS, threads)
     level = _core.box_mean(channel_mean(image), _SPREAD_RADIUS, threads)
     agreed = (np.float32(_AGREED) * level) ** 2
     share = agreed / (agreed + spread + np.float32(1e-30))

@@ -15,8 +15,7 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves
-from tungsten_dip.fit.network.layout import Pilot
-from tungsten_dip.fit.pilots.presets import FOLLOWING_PILOTS
+from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots.surfaces import Surfaces, along_edges
 
 _POSITION_SCALE_PIXELS = 20.0
@@ -54,7 +53,10 @@ class Guides:
 
 
 def first_guides(
-    colors: tuple[FloatImage, ...], surfaces: tuple[Surfaces, ...], color_variance: FloatImage | None = None
+    colors: tuple[FloatImage, ...],
+    surfaces: tuple[Surfaces, ...],
+    threads: int,
+    color_variance: FloatImage | None = None,
 ) -> Guides:
     """Return the guides of the two halves, or of the mean alone.
 
@@ -62,43 +64,42 @@ def first_guides(
     ``color_variance``, that of its colour (same shape).
     """
     irradiances = tuple(s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
-    first = _FIRST_GUIDE if surfaces[0].penalty else _FIRST_GUIDE_WITHOUT_FEATURES
+    first = _FIRST_GUIDE if surfaces[0].names else _FIRST_GUIDE_WITHOUT_FEATURES
     smooth = tuple(
-        np.maximum(_regress(image, first, s), 0) for image, s in zip(irradiances, surfaces, strict=True)
+        np.maximum(_regress(image, first, s, threads), 0)
+        for image, s in zip(irradiances, surfaces, strict=True)
     )
-    guides = _guides(smooth, irradiances, surfaces[0], color_variance)
+    guides = _guides(smooth, irradiances, surfaces, threads, color_variance)
     smooth = tuple(
-        np.maximum(_regress(image, _SECOND_GUIDE, s, guide, guides.variance), 0)
+        np.maximum(_regress(image, _SECOND_GUIDE, s, threads, guide, guides.variance), 0)
         for image, guide, s in zip(irradiances, guides.images, surfaces, strict=True)
     )
-    return _guides(smooth, irradiances, surfaces[0], color_variance)
+    return _guides(smooth, irradiances, surfaces, threads, color_variance)
 
 
 def following_guides(
-    colors: Halves, previous: Halves, surfaces: tuple[Surfaces, ...]
+    colors: Halves, previous: Halves, surfaces: tuple[Surfaces, ...], filler: Pilot, threads: int
 ) -> tuple[Guides, Halves, Halves]:
     """Return guides as `first_guides`, at a part of its cost.
 
     ``previous`` are the halves of the previous frame's result, reprojected to this one, NaN where they have
-    no value. They are the guide, filled by the first of `FOLLOWING_PILOTS`. Returns (guides, first pilot,
-    filled previous frame), the last two as linear radiance.
+    no value. They are the guide, filled by the pilot ``filler``. Returns (guides, filler's images, filled
+    previous frame), the last two as linear radiance.
     """
     irradiance_a, irradiance_b = (s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
     irradiances = irradiance_a, irradiance_b
-    first_a, first_b = (
-        s.color(_regress(image, FOLLOWING_PILOTS[0], s))
-        for image, s in zip(irradiances, surfaces, strict=True)
+    filler_a, filler_b = (
+        s.color(_regress(image, filler, s, threads)) for image, s in zip(irradiances, surfaces, strict=True)
     )
     filled_a, filled_b = (
-        np.where(np.isfinite(image), np.maximum(image, 0), first).astype(np.float32)
-        for image, first in zip(previous, (first_a, first_b), strict=True)
+        np.where(np.isfinite(image), np.maximum(image, 0), instead).astype(np.float32)
+        for image, instead in zip(previous, (filler_a, filler_b), strict=True)
     )
     smooth = tuple(
         np.maximum((image - s.smooth_emission) / s.albedo, 0)
         for image, s in zip((filled_a, filled_b), surfaces, strict=True)
     )
-    guides = _guides(smooth, irradiances, surfaces[0])
-    return guides, (first_a, first_b), (filled_a, filled_b)
+    return _guides(smooth, irradiances, surfaces, threads), (filler_a, filler_b), (filled_a, filled_b)
 
 
 @dataclass
@@ -111,6 +112,7 @@ class PilotMaker:
     colors: tuple[FloatImage, ...]
     surfaces: tuple[Surfaces, ...]
     guides: Guides
+    threads: int
     color_variance: FloatImage | None = None
     previous: Halves | None = None
 
@@ -119,7 +121,7 @@ class PilotMaker:
         match pilot.kind:
             case "edges":
                 return tuple(
-                    along_edges(color, s.edges, pilot.radius, s.threads)
+                    along_edges(color, s.edges, pilot.radius, self.threads)
                     for color, s in zip(self.colors, self.surfaces, strict=True)
                 )
             case "color":
@@ -127,7 +129,7 @@ class PilotMaker:
             case "features" | "guided":
                 surfaces, guides = self.surfaces, self.guides
         return tuple(
-            s.color(_regress(image, pilot, s, guide, guides.variance))
+            s.color(_regress(image, pilot, s, self.threads, guide, guides.variance))
             for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
         )
 
@@ -135,25 +137,27 @@ class PilotMaker:
     def _of_color(self) -> tuple[tuple[Surfaces, ...], Guides]:
         surfaces = tuple(s.without_features() for s in self.surfaces)
         if self.previous is not None:
-            return surfaces, _guides(self.previous, self.colors, surfaces[0])
-        return surfaces, first_guides(self.colors, surfaces, self.color_variance)
+            return surfaces, _guides(self.previous, self.colors, surfaces, self.threads)
+        return surfaces, first_guides(self.colors, surfaces, self.threads, self.color_variance)
 
 
 def _guides(
     images: tuple[FloatImage, ...],
     irradiances: tuple[FloatImage, ...],
-    surfaces: Surfaces,
+    surfaces: tuple[Surfaces, ...],
+    threads: int,
     color_variance: FloatImage | None = None,
 ) -> Guides:
+    """Return guides made of smooth images of the irradiances."""
     guides = tuple(np.log(image + np.float32(_GUIDE_OFFSET)) for image in images)
-    if len(guides) == 2:
-        variance = (guides[0] - guides[1]) ** 2 / 2
+    if color_variance is None:
+        guide_a, guide_b = guides
+        variance = (guide_a - guide_b) ** 2 / 2
     else:
-        assert color_variance is not None
-        squared = color_variance / surfaces.albedo**2
+        squared = color_variance / surfaces[0].albedo ** 2
         variance = squared / (_SAMPLES_OF_GUIDE * (images[0] + np.float32(_GUIDE_OFFSET)) ** 2)
     variance = np.ascontiguousarray(variance, np.float32)
-    variance = _core.box_mean(variance, _GUIDE_VARIANCE_RADIUS, surfaces.threads)
+    variance = _core.box_mean(variance, _GUIDE_VARIANCE_RADIUS, threads)
     return Guides(guides, variance + np.float32(_LEAST_GUIDE_VARIANCE), irradiances)
 
 
@@ -161,28 +165,27 @@ def _regress(
     image: FloatImage,
     pilot: Pilot,
     surfaces: Surfaces,
+    threads: int,
     guide: FloatImage | None = None,
     guide_variance: FloatImage | None = None,
 ) -> FloatImage:
-    features, names, penalty = surfaces.features, surfaces.names, surfaces.penalty
+    features = surfaces.features
+    penalty = surfaces.penalty if pilot.k is None else surfaces.guided_penalty
     if pilot.with_position:
         features = np.concatenate((features, _positions(image.shape)), axis=2)
-        names, penalty = (*names, "column", "row"), (*penalty, 0.0, 0.0)
+        penalty = (*penalty, 0.0, 0.0)
     if pilot.k is None:
-        return _core.regress(
-            image, features, penalty, radius=pilot.radius, step=pilot.step, threads=surfaces.threads
-        )
+        return _core.regress(image, features, penalty, radius=pilot.radius, step=pilot.step, threads=threads)
     return _core.regress(
         image,
         features,
-        # A guide distinguishes what differs in irradiance, but not dark surfaces from the empty space behind.
-        tuple(p if name.startswith("depth") else 0.0 for name, p in zip(names, penalty, strict=True)),
+        penalty,
         guide,
         guide_variance,
         radius=pilot.radius,
         step=pilot.step,
         k=pilot.k,
-        threads=surfaces.threads,
+        threads=threads,
     )
 
 

@@ -15,6 +15,7 @@ from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
+from tungsten_dip.fit.pilots.surfaces import images_for
 from tungsten_dip.fit.preparation.exposure import scaled
 
 _LOG = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ def oidn_pilot(
     shape (height, width, 3). So are the results.
     """
     features = (
-        feature.images(len(colors)) if feature else [None] * len(colors)
+        images_for(colors, feature) if feature else [None] * len(colors)
         for feature in (buffers.albedo, buffers.normal)
     )
     return tuple(

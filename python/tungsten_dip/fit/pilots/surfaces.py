@@ -11,7 +11,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.prefilter import prefilter_features
-from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, Halves, RenderBuffers, mean_of
+from tungsten_dip.buffers.render_buffers import (
+    FEATURES,
+    Buffer,
+    FloatImage,
+    Halves,
+    Quantity,
+    RenderBuffers,
+    mean_of,
+)
 from tungsten_dip.fit.neighbours import window_pixels
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
@@ -32,7 +40,7 @@ _BLACK_ALBEDO = 1e-3
 _BRIGHTEST_ALBEDO = 1e6
 """The regression does not distinguish brighter emission, in the renderer's units."""
 
-EDGES_RADIUS = 6
+EDGES_SIGMA = 6
 """Standard deviation, in pixels, of the means along edges that smooth emission and that are a pilot."""
 
 _ACROSS_EDGES = 0.3
@@ -51,26 +59,43 @@ of both halves' 3x3, in which two about as bright thus suffice."""
 
 
 @dataclass(frozen=True)
+class _Channel:
+    """A channel of the features, scaled, shape (height, width), and the penalties of its differences.
+
+    Beside a guide ``guided_penalty`` holds: it distinguishes what differs in irradiance by itself.
+    """
+
+    image: FloatImage
+    penalty: float
+    guided_penalty: float = 0.0
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is the same in every pixel."""
+        return bool(np.ptp(self.image) == 0)
+
+
+@dataclass(frozen=True)
 class Surfaces:
     """The surfaces as one half shows them: the features to regress on, and how the colour is demodulated.
 
     ``features`` (height, width, n) are pre-filtered and scaled, with one of ``names`` and one ``penalty``
-    each. Features that are the same in every pixel are not among them; ``left_out`` maps their names to their
-    values. ``albedo`` (height, width, 3), never 0, divides the colour. ``emission`` (height, width, 3) is the
-    radiance emitted towards the half's own samples, which is subtracted before, and ``smooth_emission`` the
-    denoised one that is added back, both linear and in the units of `evidence.Evidence`. ``edges``, shape
-    (height, width, 3), is the features' structure tensor.
+    each, ``guided_penalty`` beside a guide. Features that are the same in every pixel are not among them;
+    ``left_out`` maps their names to their values. ``albedo`` (height, width, 3), never 0, divides the colour.
+    ``emission`` (height, width, 3) is the radiance emitted towards the half's own samples, which is
+    subtracted before, and ``smooth_emission`` the denoised one that is added back, both linear and in the
+    units of `evidence.Evidence`. ``edges``, shape (height, width, 3), is the features' structure tensor.
     """
 
     features: FloatImage
     names: tuple[str, ...]
     left_out: dict[str, float]
     penalty: tuple[float, ...]
+    guided_penalty: tuple[float, ...]
     albedo: FloatImage
     emission: FloatImage
     smooth_emission: FloatImage
     edges: FloatImage
-    threads: int
 
     def irradiance(self, color: FloatImage) -> FloatImage:
         """Return the irradiance (colour without emission, divided by albedo) of a noisy half ``color``."""
@@ -90,13 +115,14 @@ class Surfaces:
             features=np.empty((*self.features.shape[:2], 0), np.float32),
             names=(),
             penalty=(),
+            guided_penalty=(),
             albedo=np.ones_like(self.albedo),
             emission=nothing,
             smooth_emission=nothing,
         )
 
 
-def surfaces_of_halves(
+def surfaces_of_colors(
     buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
 ) -> tuple[Surfaces, ...]:
     """Pre-filter, scale and select the features of sanitised buffers; return the surfaces of every colour.
@@ -107,33 +133,35 @@ def surfaces_of_halves(
     that scores them would be mistaken for signal. Features without halves, and alpha, which has none, are the
     exception.
     """
-    count = len(colors)
     alpha = alpha_as_albedo(buffers)
     if alpha is not None:
         buffers = replace(buffers, albedo=Buffer(np.repeat(alpha, 3, axis=2)))
-    albedos: tuple[FloatImage, ...] = ()
+    albedos: Sequence[FloatImage | None] = [None] * len(colors)
     if buffers.albedo is not None:
         rendered = _without_stray_emission(buffers.albedo, threads)
-        albedos = _bounded_albedos(rendered, colors, scale)
-        buffers = replace(buffers, albedo=_with_planes(rendered, albedos))
+        albedos = bounded = _bounded_albedos(rendered, colors, scale)
+        buffers = replace(buffers, albedo=_with_planes(rendered, bounded))
     filtered = prefilter_features(buffers, threads)
     depth_scale = _depth_scale(filtered)
-    channels_of_colors = [
-        _feature_channels(filtered, index, count, depth_scale, of_alpha=alpha is not None)
-        for index in range(count)
+    features = [
+        {
+            name: images_for(colors, feature)[index]
+            for name in FEATURES
+            if (feature := filtered.get(name)) is not None
+        }
+        for index in range(len(colors))
     ]
-    flat = [
-        name
-        for name in channels_of_colors[0]
-        if all(np.ptp(channels[name][0]) == 0 for channels in channels_of_colors)
-    ]
-    albedo_pairs: Sequence[tuple[FloatImage, FloatImage] | None] = [None] * count
-    if filtered.albedo is not None:
-        albedo_pairs = list(zip(albedos, filtered.albedo.images(count), strict=True))
+    channels = [_channels(images, depth_scale, of_alpha=alpha is not None) for images in features]
+    flat = [name for name in channels[0] if all(of_color[name].flat for of_color in channels)]
     return tuple(
-        _surfaces(channels, flat, albedo_pair, color.shape, scale, threads)
-        for channels, albedo_pair, color in zip(channels_of_colors, albedo_pairs, colors, strict=True)
+        _surfaces(of_color, flat, albedo, images.get("albedo"), color.shape, scale, threads)
+        for of_color, albedo, images, color in zip(channels, albedos, features, colors, strict=True)
     )
+
+
+def images_for(colors: tuple[FloatImage, ...], buffer: Buffer) -> tuple[FloatImage, ...]:
+    """Return what of a buffer belongs to each of ``colors``: its halves, or its mean."""
+    return buffer.halves_or_mean if len(colors) == 2 else (buffer.mean,)
 
 
 def emission_of_halves(buffers: RenderBuffers, colors: Halves, scale: float) -> Halves | None:
@@ -168,7 +196,7 @@ def _bounded_albedos(albedo: Buffer, colors: tuple[FloatImage, ...], scale: floa
     """
     return tuple(
         np.minimum(plane, 1 + np.maximum(color / np.float32(scale), 0))
-        for plane, color in zip(albedo.images(len(colors)), colors, strict=True)
+        for plane, color in zip(images_for(colors, albedo), colors, strict=True)
     )
 
 
@@ -189,35 +217,43 @@ def _depth_scale(filtered: RenderBuffers) -> float:
 
 
 def _surfaces(
-    channels: dict[str, tuple[FloatImage, float]],
+    channels: dict[str, _Channel],
     flat: Sequence[str],
-    albedos: tuple[FloatImage, FloatImage] | None,
+    albedo: FloatImage | None,
+    filtered_albedo: FloatImage | None,
     shape: tuple[int, ...],
     scale: float,
     threads: int,
 ) -> Surfaces:
-    """Return the surfaces of one colour of this shape.
+    """Return the surfaces of one colour of this shape, with the channels that are not ``flat``.
 
-    ``channels`` are those of `_feature_channels`, of which those named by ``flat`` are left out. ``albedos``
-    is the albedo before and after pre-filtering, if there is one.
+    The albedo is None, before and after pre-filtering, if there is none.
     """
-    kept = tuple(name for name in channels if name not in flat)
+    kept = {name: channel for name, channel in channels.items() if name not in flat}
     features = np.empty((*shape[:2], len(kept)), np.float32)
-    for index, name in enumerate(kept):
-        features[:, :, index] = channels[name][0]
-    penalty = tuple(channels[name][1] for name in kept)
+    for index, channel in enumerate(kept.values()):
+        features[:, :, index] = channel.image
+    penalty = tuple(channel.penalty for channel in kept.values())
     edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
-    albedo = np.ones(shape, np.float32)
+    divided_by = np.ones(shape, np.float32)
     emission = smooth_emission = np.zeros(shape, np.float32)
-    if albedos is not None:
-        noisy, smooth = albedos
-        albedo = divisor(np.clip(smooth, 0, 1))
-        emission = np.maximum(noisy - 1, 0) * np.float32(scale)
-        smooth_emission = np.maximum(smooth - 1, 0) * np.float32(scale)
+    if albedo is not None and filtered_albedo is not None:
+        divided_by = divisor(np.clip(filtered_albedo, 0, 1))
+        emission = np.maximum(albedo - 1, 0) * np.float32(scale)
+        smooth_emission = np.maximum(filtered_albedo - 1, 0) * np.float32(scale)
         if emission.any():
             smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
-    left_out = {name: float(channels[name][0][0, 0]) for name in flat}
-    return Surfaces(features, kept, left_out, penalty, albedo, emission, smooth_emission, edges, threads)
+    return Surfaces(
+        features=features,
+        names=tuple(kept),
+        left_out={name: float(channels[name].image[0, 0]) for name in flat},
+        penalty=penalty,
+        guided_penalty=tuple(channel.guided_penalty for channel in kept.values()),
+        albedo=divided_by,
+        emission=emission,
+        smooth_emission=smooth_emission,
+        edges=edges,
+    )
 
 
 def _smooth_emission(
@@ -225,7 +261,7 @@ def _smooth_emission(
 ) -> FloatImage:
     # The pre-filter blurs long edges of bright lights, the mean along edges their corners, and both smear
     # lamps of few pixels.
-    smooth: FloatImage = np.float32(0.5) * (filtered + along_edges(emission, edges, EDGES_RADIUS, threads))
+    smooth: FloatImage = np.float32(0.5) * (filtered + along_edges(emission, edges, EDGES_SIGMA, threads))
     own, level = channel_mean(emission)[:, :, 0], channel_mean(smooth)[:, :, 0]
     smeared = np.nonzero(level > np.float32(_MOST_SMEARED) * own)
     windows = sliding_window_view(np.pad(own, 1, mode="edge"), (3, 3))
@@ -254,36 +290,37 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     return replace(albedo, mean=albedo.mean - taken, half_a=kept_a, half_b=kept_b)
 
 
-def _feature_channels(
-    filtered: RenderBuffers, index: int, count: int, depth_scale: float, of_alpha: bool
-) -> dict[str, tuple[FloatImage, float]]:
-    """Return every channel of the features of one of ``count`` colours, scaled, and its penalty.
+def _channels(
+    features: dict[Quantity, FloatImage], depth_scale: float, *, of_alpha: bool
+) -> dict[str, _Channel]:
+    """Return every channel of the pre-filtered features of one colour, by name.
 
     ``of_alpha``: the albedo is alpha, three times.
     """
-    scaled: list[tuple[str, FloatImage, float]] = []
-    if filtered.albedo is not None:
-        albedo = filtered.albedo.images(count)[index]
+    channels: dict[str, _Channel] = {}
+
+    def add(name: str, image: FloatImage, penalty: float, guided_penalty: float = 0.0) -> None:
+        for column, channel in enumerate(_CHANNELS[name]):
+            channels[f"{name}.{channel}"] = _Channel(image[:, :, column], penalty, guided_penalty)
+
+    if "albedo" in features:
+        albedo = features["albedo"]
         # Light must not mix with what it lights, but may be brighter by any factor.
         brightness = np.log(np.clip(albedo, 1, _BRIGHTEST_ALBEDO))
         bounded = np.clip(albedo, 0, 1) + brightness
         if of_alpha:
-            scaled.append(("alpha", bounded[:, :, :1], 3 * _ALBEDO_PENALTY))
+            add("alpha", bounded[:, :, :1], 3 * _ALBEDO_PENALTY)
         else:
-            scaled.append(("albedo", bounded, _ALBEDO_PENALTY))
-    if filtered.normal is not None:
-        normal = np.clip(filtered.normal.images(count)[index], -1, 1)
-        scaled.append(("normal", normal, _NORMAL_PENALTY))
-    if filtered.depth is not None:
-        depth = filtered.depth.images(count)[index]
+            add("albedo", bounded, _ALBEDO_PENALTY)
+    if "normal" in features:
+        add("normal", np.clip(features["normal"], -1, 1), _NORMAL_PENALTY)
+    if "depth" in features:
+        depth = features["depth"]
         # Bounded for any unit of length; near and far surfaces stay apart.
         bounded = np.float32(_DEPTH_SCALE) * depth / (depth + np.float32(depth_scale))
-        scaled.append(("depth", bounded, _DEPTH_PENALTY))
-    return {
-        f"{name}.{channel}": (image[:, :, column], penalty)
-        for name, image, penalty in scaled
-        for column, channel in enumerate(_CHANNELS[name])
-    }
+        # A guide does not distinguish dark surfaces from the empty space behind.
+        add("depth", bounded, _DEPTH_PENALTY, guided_penalty=_DEPTH_PENALTY)
+    return channels
 
 
 def divisor(albedo: FloatImage) -> FloatImage:
@@ -292,8 +329,8 @@ def divisor(albedo: FloatImage) -> FloatImage:
     return np.where(black, np.float32(1), albedo + np.float32(_ALBEDO_OFFSET))
 
 
-def along_edges(image: FloatImage, edges: FloatImage, radius: float, threads: int) -> FloatImage:
+def along_edges(image: FloatImage, edges: FloatImage, sigma: float, threads: int) -> FloatImage:
     """Return the mean along edges (a structure tensor), with this standard deviation in pixels."""
     return _core.smooth_along_edges(
-        np.ascontiguousarray(image), edges, along=radius, across=_ACROSS_EDGES, threads=threads
+        np.ascontiguousarray(image), edges, along=sigma, across=_ACROSS_EDGES, threads=threads
     )

@@ -12,6 +12,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.half_buffers import without_foreign_halves, without_single_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.preparation.splitting import with_lost_halves_drawn
 from tungsten_dip.fit.result import FitResult
@@ -54,12 +55,12 @@ def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
     rendered = buffers.color
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
-    buffers, lost = _without_lost_halves(buffers, rendered, threads)
+    buffers, lost = _without_lost_halves(buffers, rendered, thread_count(threads))
     return Prepared(buffers, (*single, *foreign, *repaired, *lost))
 
 
 def _without_lost_halves(
-    buffers: RenderBuffers, rendered: Buffer, threads: int | None
+    buffers: RenderBuffers, rendered: Buffer, threads: int
 ) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Return sanitised buffers with halves drawn where a half is lost, and a note if there are such pixels.
 

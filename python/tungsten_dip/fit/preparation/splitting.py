@@ -19,8 +19,14 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.half_buffers import HalvesTest, compare_halves
 from tungsten_dip.buffers.prefilter import noise_in
-from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, FloatImage, Halves, RenderBuffers
-from tungsten_dip.cores import thread_count
+from tungsten_dip.buffers.render_buffers import (
+    Buffer,
+    FloatArray,
+    FloatImage,
+    Halves,
+    RenderBuffers,
+    variance_of_mean,
+)
 from tungsten_dip.fit.neighbours import largest_around, mean_around
 from tungsten_dip.fit.preparation.exposure import exposure, scaled
 
@@ -62,8 +68,13 @@ class HalvedImage:
     drawn: bool = False
     notes: tuple[str, ...] = ()
 
+    @property
+    def halves(self) -> Halves:
+        """The halves of the colour."""
+        return self.buffers.color.halves_or_mean
 
-def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int | None) -> HalvedImage:
+
+def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int) -> HalvedImage:
     """Return sanitised buffers with independent halves of the colour.
 
     Unless the buffers have such halves, they are drawn from the mean of all samples, whose noise is estimated
@@ -84,7 +95,7 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int | No
 
 
 def with_lost_halves_drawn(
-    buffers: RenderBuffers, lost: npt.NDArray[np.bool_], threads: int | None
+    buffers: RenderBuffers, lost: npt.NDArray[np.bool_], threads: int
 ) -> RenderBuffers:
     """Return sanitised buffers with halves, drawn where ``lost``, from a mean that is the half left there.
 
@@ -100,9 +111,8 @@ def with_lost_halves_drawn(
 
     color = merged(buffers.color, drawn.color)
     if color.variance is not None:
-        a, b = color.halves_or_mean
         with np.errstate(over="ignore"):
-            squared = np.minimum((a - b) ** 2 / 4, np.finfo(np.float32).max)
+            squared = np.minimum(variance_of_mean(color.halves_or_mean), np.finfo(np.float32).max)
         color = replace(color, variance=np.where(lost, squared, color.variance))
     albedo = buffers.albedo
     if albedo is not None and drawn.albedo is not None and drawn.albedo is not albedo:
@@ -110,17 +120,17 @@ def with_lost_halves_drawn(
     return buffers.with_quantities(color=color, albedo=albedo)
 
 
-def _with_drawn_halves(buffers: RenderBuffers, seed: int, threads: int | None) -> RenderBuffers:
+def _with_drawn_halves(buffers: RenderBuffers, seed: int, threads: int) -> RenderBuffers:
     """Return buffers with halves drawn from the mean, also of the light that the albedo contains."""
     color, albedo = buffers.color, buffers.albedo
     emitted = np.zeros_like(color.mean) if albedo is None else np.maximum(albedo.mean - 1, 0)
-    share = _share_of_half_a(color.mean, emitted, seed, thread_count(threads))
+    share = _share_of_half_a(color.mean, emitted, seed, threads)
     split = {"color": Buffer(color.mean, *_split(color.mean, share), color.variance)}
     if albedo is not None and emitted.any():
         # The colour contains the emitted light, too, and with the same noise.
         surfaces = (np.minimum(half, 1) for half in albedo.halves_or_mean)
         half_a, half_b = (half + light for half, light in zip(surfaces, _split(emitted, share), strict=True))
-        variance = albedo.variance if albedo.halves else noise_in(albedo.mean, thread_count(threads))
+        variance = albedo.variance if albedo.halves else noise_in(albedo.mean, threads)
         split["albedo"] = Buffer(albedo.mean, half_a, half_b, variance)
     return buffers.with_quantities(**split)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,8 @@ import numpy.typing as npt
 
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
-from tungsten_dip.buffers.render_buffers import FloatArray, Halves, mean_of
+from tungsten_dip.buffers.render_buffers import FloatArray, Halves, mean_of, variance_of_mean
+from tungsten_dip.fit.candidates import Candidates
 
 _CHUNK_PIXELS = 1 << 18
 _BIAS = 2.4
@@ -28,7 +28,7 @@ _OVERFLOW_BOUND = 1e30
 """Larger relative squared errors count as this large: their sums overflow."""
 
 
-def estimate_error(candidates: Sequence[Halves], scale: float, denoised: Halves) -> FloatArray:
+def estimate_error(candidates: Candidates, scale: float, denoised: Halves) -> FloatArray:
     """Estimate the squared error of the mean f of both outputs in each pixel, relative to f^2 + 0.01.
 
     ``candidates`` and ``scale`` are the evidence's, ``denoised`` the outputs f_a and f_b for one half each,
@@ -41,10 +41,10 @@ def estimate_error(candidates: Sequence[Halves], scale: float, denoised: Halves)
     """
     output = mean_of(denoised)
     epsilon = epsilon_of_renderer(scale)
-    squared = (denoised[0] - denoised[1]) ** 2 / 4
+    squared = variance_of_mean(denoised)
     variance = np.empty(len(output), np.float32)
     bias = np.empty(len(output), np.float32)
-    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in candidates[1:]]
+    computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in candidates.filtered]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
         relative = 1 / (output[part] ** 2 + epsilon)
@@ -57,26 +57,26 @@ def estimate_error(candidates: Sequence[Halves], scale: float, denoised: Halves)
             apart_squared = np.minimum(np.median(apart, axis=0), _OVERFLOW_BOUND)
         # The root of each: their product would overflow.
         bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
-    estimated, standard_error = error_from_halves(candidates[0], denoised, epsilon)
+    estimated, standard_error = error_from_halves(candidates.noisy, denoised, epsilon)
     least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
     allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
     return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
 
 
-def held_out_error(candidates: Sequence[Halves], denoised: Halves) -> float:
+def held_out_error(candidates: Candidates, denoised: Halves) -> float:
     """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
-    exposure. Estimated from the noisy halves or, where their standard error is too large, from the smallest
+    exposure. Estimated from the noisy halves or, where their standard error is too large, from the first
     pilot, far less noisy but a little blurred.
     """
     epsilon = np.float32(RELMSE_EPSILON)
-    for targets in candidates[:2]:
+    for targets in (candidates.noisy, candidates.pilots[0]):
         mean, standard_error = error_from_halves(targets, denoised, epsilon)
         if is_sure(mean, standard_error):
             break
     relative = 1 / (mean_of(denoised) ** 2 + epsilon)
-    return max(mean, float(((denoised[0] - denoised[1]) ** 2 / 4 * relative).mean(dtype=np.float64)))
+    return max(mean, float((variance_of_mean(denoised) * relative).mean(dtype=np.float64)))
 
 
 def error_from_halves(targets: Halves, denoised: Halves, epsilon: np.float32) -> tuple[float, float]:
@@ -98,7 +98,7 @@ def crossed_errors(noisy: Halves, denoised: Halves) -> tuple[FloatArray, FloatAr
     """
     (a, b), (denoised_a, denoised_b) = noisy, denoised
     with np.errstate(over="ignore", invalid="ignore"):
-        variance: FloatArray = (denoised_a - denoised_b) ** 2 / np.float32(4)
+        variance = variance_of_mean(denoised)
         of_one = (denoised_a - a) * (denoised_b - b) + 2 * variance
     return of_one, variance
 

@@ -11,6 +11,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves
+from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.neighbours import mean_around
 
 _ERROR_RADIUS = 8
@@ -56,23 +57,23 @@ class ErrorMeasure:
         return ErrorMeasure(denominators, caps)
 
 
-def error_measure(candidates: Sequence[Halves], pilots: Sequence[Halves], threads: int) -> ErrorMeasure:
-    """Return the measure for the errors of candidates, among which are the ``pilots`` of our filters."""
-    denominators = _denominators(pilots)
+def error_measure(candidates: Candidates, threads: int) -> ErrorMeasure:
+    """Return the measure for the errors of candidates."""
+    denominators = _denominators(candidates.pilots)
     return ErrorMeasure(denominators, _caps(candidates, denominators, threads))
 
 
-def best_candidate(candidates: Sequence[Halves], measure: ErrorMeasure) -> int:
-    """Return the index of the candidate with the least error; the noisy halves, the first, do not count."""
-    halves = candidates[0]
+def best_candidate(candidates: Candidates, measure: ErrorMeasure) -> int:
+    """Return the index of the candidate with the least error; the noisy image, the first, does not count."""
 
     def mean_error(candidate: Halves) -> float:
+        halves = candidates.noisy[::-1]
         return sum(
             float(np.minimum(_relative_error(image, other, denominator), 1).mean())
-            for image, other, denominator in zip(candidate, halves[::-1], measure.denominators, strict=True)
+            for image, other, denominator in zip(candidate, halves, measure.denominators, strict=True)
         )
 
-    return 1 + int(np.argmin([mean_error(candidate) for candidate in candidates[1:]]))
+    return 1 + int(np.argmin([mean_error(candidate) for candidate in candidates.filtered]))
 
 
 def _denominators(pilots: Sequence[Halves]) -> Halves:
@@ -90,13 +91,13 @@ def _denominators(pilots: Sequence[Halves]) -> Halves:
     return a, b
 
 
-def _caps(candidates: Sequence[Halves], denominators: Halves, threads: int) -> Halves:
+def _caps(candidates: Candidates, denominators: Halves, threads: int) -> Halves:
     """Return the caps, from the mean error of each half's candidates by that half itself."""
 
     def cap(half: int) -> FloatImage:
-        noisy, denominator = candidates[0][half], denominators[half]
-        errors = (_relative_error(candidate[half], noisy, denominator) for candidate in candidates[1:])
-        mean = sum(errors, np.zeros_like(denominator)) / np.float32(len(candidates) - 1)
+        noisy, denominator = candidates.noisy[half], denominators[half]
+        errors = (_relative_error(candidate[half], noisy, denominator) for candidate in candidates.filtered)
+        mean = sum(errors, np.zeros_like(denominator)) / np.float32(len(candidates.filtered))
         around = _core.box_mean(mean, _ERROR_RADIUS, threads)
         return np.float32(_OUTLIER) * around + np.float32(_LEAST_CAP)
 
