@@ -103,7 +103,7 @@ def evidence_from_buffers(
     """
     layout, pilots = (plan, plan.pilots) if isinstance(plan, Layout) else (None, plan)
     buffers = image.buffers
-    scale = exposure(buffers.color.mean)
+    scale = exposure(buffers.color)
     mean, limited = _without_fireflies(image, scale, threads)
     halves = limited.halves
     surfaces = surfaces_of_colors(buffers, halves, scale, threads)

@@ -44,7 +44,7 @@ def image_without_noise(buffers: RenderBuffers, threads: int) -> DenoisedImage |
     a, b = color.halves_or_mean
     noise = (a - b).astype(np.float64) ** 2 / 4
     # Dark images are not mistaken for clean ones.
-    bright = squared + RELMSE_EPSILON / exposure(color.mean) ** 2
+    bright = squared + RELMSE_EPSILON / exposure(color) ** 2
     estimated = [float(np.mean(n / bright)) for n in (noise, color.variance) if n is not None]
     if max(estimated) >= _CONVERGED or (estimated == [0] and not black):
         return None

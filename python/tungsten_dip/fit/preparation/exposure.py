@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tungsten_dip.buffers.render_buffers import FloatImage
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage
 
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant of `fit` relies on it."""
@@ -13,14 +13,26 @@ _BRIGHTEST = 1e15
 """Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
 
 
-def exposure(color: FloatImage) -> float:
-    """Return the power of two that brings the median of the lit pixels near the typical radiance."""
-    level = color.mean(axis=2, dtype=np.float64)
-    lit = level[level > 0]
-    if lit.size == 0:
+def exposure(color: Buffer) -> float:
+    """Return the power of two that brings the median of the lit pixels near the typical radiance.
+
+    Pixels count by their noise, the relative difference of their halves, if there are halves: a clear sky has
+    none to remove, and what it outshines must not be as if it were black.
+    """
+    level = color.mean.mean(axis=2, dtype=np.float64)
+    lit = level > 0
+    if not lit.any():
         return 1.0
+    half_a, half_b = color.halves_or_mean
+    apart = np.abs(half_a - half_b).mean(axis=2, dtype=np.float64)
+    weight = apart[lit] / level[lit]
+    if not weight.any():
+        weight = np.ones_like(weight)
+    order = np.argsort(level[lit])
+    reached = np.cumsum(weight[order])
+    median = level[lit][order][np.searchsorted(reached, reached[-1] / 2)]
     # Powers that float32 can hold.
-    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / np.median(lit))), -126, 126))
+    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / median)), -126, 126))
 
 
 def scaled(image: FloatImage, scale: float) -> FloatImage:

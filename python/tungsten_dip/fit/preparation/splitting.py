@@ -141,7 +141,7 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     It is the same for all channels in as many pixels as their noise is correlated: of a path that found light
     all channels are bright, but not of one that a spectral renderer traced for a single wavelength.
     """
-    image = scaled(color, exposure(color))
+    image = scaled(color, exposure(Buffer(color)))
     random = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
     around = _core.box_mean(image, _MEAN_RADIUS, threads)
     level = around.astype(np.float64) ** 2
