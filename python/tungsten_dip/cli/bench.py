@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tungsten_dip.cli.console import add_json, add_threads, duration, integers, progress_on_stderr
 from tungsten_dip.cli.denoising import add_map, layer_mapping
+from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.fit.paper.constants import ITERATIONS
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def _add_common(parser: argparse.ArgumentParser, folder: str, one: bool = False)
     add_json(parser)
 
 
-def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _pareto(options: argparse.Namespace) -> Outcome:
     from tungsten_dip.bench.methods import Plan
     from tungsten_dip.bench.pareto import run_pareto
     from tungsten_dip.bench.sets import read_sets
@@ -118,10 +119,10 @@ def _pareto(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         for each in found
     }
     tables = "\n\n".join(f"{each.bench_set.name}\n\n{markdown_table(each)}" for each in found)
-    return facts, f"{tables}\n\n{options.output / 'page.html'} shows them"
+    return Outcome(facts, f"{tables}\n\n{options.output / 'page.html'} shows them")
 
 
-def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _paper(options: argparse.Namespace) -> Outcome:
     from tungsten_dip.bench.paper_table import SCENES, run_paper_table
     from tungsten_dip.bench.sets import cropped_as_published, read_sets
 
@@ -138,10 +139,10 @@ def _paper(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
             threads=options.threads,
             progress=progress,
         )
-    return {"output": str(options.output), "table": text}, text
+    return Outcome({"output": str(options.output), "table": text}, text)
 
 
-def _iteration(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _iteration(options: argparse.Namespace) -> Outcome:
     from tungsten_dip.bench.iteration import time_iterations, times_text
 
     width, height = options.size
@@ -154,7 +155,8 @@ def _iteration(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
             threads=options.threads,
             progress=progress,
         )
-    return {**asdict(times), "speedup": times.speedup}, times_text(times, width, height, options.threads)
+    facts = {**asdict(times), "speedup": times.speedup}
+    return Outcome(facts, times_text(times, width, height, options.threads))
 
 
 def _names(text: str) -> tuple[str, ...]:

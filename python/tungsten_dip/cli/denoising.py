@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import logging
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from tungsten_dip.buffers.render_buffers import RenderBuffers
 from tungsten_dip.cli.console import duration, progress_on_stderr
@@ -100,28 +100,31 @@ def layer_mapping(options: argparse.Namespace) -> dict[str, str]:
 
 
 def fit_settings(
-    options: argparse.Namespace, names: Sequence[str], warm_start: Model | None = None
+    options: Mapping[str, Any], names: Sequence[str], warm_start: Model | None = None
 ) -> FitSettings:
-    """Return the settings (a model's, to start from it) with those of the named options that were given."""
-    if warm_start is not None and options.preset not in (None, warm_start.settings.preset):
+    """Return the settings (a model's, to start from it) with those of the named options that were given.
+
+    ``options`` are a command's by name, None where an option was not given.
+    """
+    preset = options["preset"]
+    if warm_start is not None and preset not in (None, warm_start.settings.preset):
         # Reported here: what else the model leaves open may be nothing that this preset has.
-        check_settings(warm_start, FitSettings(options.preset))
+        check_settings(warm_start, FitSettings(preset))
     settings = FitSettings() if warm_start is None else replace(warm_start.settings, iterations=None)
-    given = {name: getattr(options, name) for name in names}
-    return replace(settings, **{name: value for name, value in given.items() if value is not None})
+    return replace(settings, **{name: options[name] for name in names if options[name] is not None})
 
 
-def load_warm_start(options: argparse.Namespace) -> Model | None:
-    """Return the model that the fit is to start from, if any."""
-    if options.warm_start is None:
+def load_warm_start(path: Path | None) -> Model | None:
+    """Return the model that the fit is to start from, None without a path."""
+    if path is None:
         return None
     with deferred_interrupts():
         from tungsten_dip.onnx import load_model  # imports ONNX
 
-    return load_model(options.warm_start)
+    return load_model(path)
 
 
-def check_no_input(outputs: Iterable[Path | None], inputs: Collection[Path]) -> None:
+def check_outputs_are_not_inputs(outputs: Iterable[Path | None], inputs: Collection[Path]) -> None:
     """Raise InputError if one of the outputs, where they are named, is among the resolved inputs."""
     for path in outputs:
         if path is not None and path.resolve() in inputs:

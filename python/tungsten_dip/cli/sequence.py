@@ -19,11 +19,12 @@ from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     add_file_options,
     add_fit_options,
-    check_no_input,
+    check_outputs_are_not_inputs,
     fit_settings,
     layer_mapping,
     load_warm_start,
 )
+from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.cores import MOST_THREADS
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit.settings import Preset
@@ -75,7 +76,7 @@ _REFIT_HELP = (
 )
 
 
-def _sequence(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _sequence(options: argparse.Namespace) -> Outcome:
     frames, run, models = _arguments(options)
     records, models = _denoised(options, frames, run, models)
     if options.report is not None:
@@ -115,13 +116,13 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
     mapping = layer_mapping(options)
-    check_no_input((frame.output for frame in frames), set(_input_files(frames, mapping)))
+    check_outputs_are_not_inputs((frame.output for frame in frames), set(_input_files(frames, mapping)))
     results = [(frames[0].output, ".exr"), (options.report, ".html"), (options.save_model, ".onnx")]
     for file, suffix in results:
         if file is not None:
             check_suffix(file, suffix)
-    warm_start = load_warm_start(options)
-    settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
+    warm_start = load_warm_start(options.warm_start)
+    settings = fit_settings(vars(options), (*FIT_OPTIONS, "threads"), warm_start)
     digest = None if warm_start is None else hashlib.sha256(options.warm_start.read_bytes()).hexdigest()
     run = Run(settings, options.refit, mapping, options.float16, digest)
     _make_writable(frames[0].output.parent, results)
@@ -143,7 +144,7 @@ def _denoised(
         return denoise_on_cluster(frames, run, options.scheduler, workers, models, progress, _tell)
 
 
-def _summary(records: list[Record], errors: list[str]) -> tuple[dict[str, Any], str]:
+def _summary(records: list[Record], errors: list[str]) -> Outcome:
     """Return what is told in the end; ``errors`` come after that of frames without a result."""
     from tungsten_dip.sequence.frames import text_from_numbers
 
@@ -153,14 +154,16 @@ def _summary(records: list[Record], errors: list[str]) -> tuple[dict[str, Any], 
         rest = "" if len(failures) == len(records) else "; the others are done"
         listed = text_from_numbers(failures)
         errors = [f"{len(failures)} of {len(records)} frames without a result: {listed}{rest}", *errors]
-    if errors:
-        facts["error"] = "; ".join(errors)
+    error = "; ".join(errors) or None
+    if error is not None:
+        facts["error"] = error
     done = [record for record in records if not record.skipped and record.error is None]
     seconds = sum(record.seconds for record in done)
     skipped = sum(record.skipped for record in records)
     before = f"; {skipped} {'was' if skipped == 1 else 'were'} finished before" if skipped else ""
     frame_or_frames = "frame" if len(done) == 1 else "frames"
-    return facts, f"{len(done)} {frame_or_frames}, denoised in {seconds:.1f} s in all{before}"
+    text = f"{len(done)} {frame_or_frames}, denoised in {seconds:.1f} s in all{before}"
+    return Outcome(facts, text, error)
 
 
 def _make_writable(folder: Path, results: Sequence[tuple[Path | None, str]]) -> None:

@@ -9,29 +9,34 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NoReturn, TypeVar, get_args
+from typing import Literal, NoReturn, TypeVar
 
-import tungsten_dip
 from tungsten_dip.buffers.atomic import check_writable, write_text
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.render_buffers import CHANNELS, RenderBuffers
 from tungsten_dip.buffers.write import write_denoised
-from tungsten_dip.cli.console import Parser, minutes, progress_on_stderr, run
+from tungsten_dip.cli.console import minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
-    REPORT_HELP,
-    add_fit_options,
-    check_no_input,
+    check_outputs_are_not_inputs,
     denoise_with_progress,
     fit_settings,
     load_warm_start,
     write_model,
 )
 from tungsten_dip.cli.scene_outputs import SceneOutputs, scene_outputs, write_render
+from tungsten_dip.cli.tungsten_options import (
+    Options,
+    check_checkpoints,
+    check_options,
+    parse,
+    print_help,
+    stock_arguments,
+)
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
-from tungsten_dip.hosts import Host, chosen_host, native
+from tungsten_dip.hosts import chosen_host, native
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba
 from tungsten_dip.interrupts import deferred_interrupts
@@ -58,11 +63,11 @@ _R = TypeVar("_R")
 
 @dataclass(frozen=True)
 class _Job:
-    """A scene to render, its files, and the options with its own seed."""
+    """A scene to render, its files, and the options with the scene's own seed."""
 
     scene: Scene
     outputs: SceneOutputs
-    options: argparse.Namespace
+    options: Options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,62 +107,45 @@ def write_outputs(
 
 
 def _run(arguments: Sequence[str] | None) -> None:
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    parser = _parser()
-    end = arguments.index("--") if "--" in arguments else len(arguments)
-    options = parser.parse_intermixed_args(arguments[:end])  # which loses the sign that options end
-    options.scenes += map(Path, arguments[end + 1 :])
-    # The native command does not know the sign, but an absolute path is no option to it.
-    arguments[end:] = [str(Path(scene).absolute()) for scene in arguments[end + 1 :]]
+    options, native_arguments = parse(sys.argv[1:] if arguments is None else arguments)
     if not options.scenes:
-        parser.print_help()
+        print_help()
         return
-    if not options.dip_denoise:
-        for name in (*FIT_OPTIONS, "report", "save_model", "warm_start", "dip_preview"):
-            if getattr(options, name) not in (None, False):
-                raise InputError("--dip options are given, yet nothing is to be denoised; add --dip-denoise")
-    for name in ("output_file", "hdr_output_file", "report", "save_model"):
-        path, count = getattr(options, name), len(options.scenes)
-        if path is not None and count > 1:
-            raise InputError(f"{path}: one file for {count} scenes; render them one at a time")
-    if options.input_directory is not None and not options.input_directory.is_dir():
-        raise InputError(f"-i {options.input_directory}: no such folder; check the name")
-
+    check_options(options)
     host = chosen_host(options.host)
     _LOG.info("rendering with %s", host.capitalize())
-    if host == "mitsuba" and (options.checkpoint or options.dip_preview):
-        raise InputError(
-            "Mitsuba saves no checkpoints for --checkpoint and --dip-preview; add --host tungsten"
-        )
-    if options.dip_preview and options.checkpoint == 0:
-        raise InputError(
-            "--checkpoint 0: without checkpoints there is no --dip-preview; name a time between them, as 5m"
-        )
+    check_checkpoints(options, host)
     if host == "tungsten" and not options.dip_denoise:
-        _run_native(_stock_arguments(arguments))
+        _run_native(stock_arguments(native_arguments))
     if host == "tungsten" and not tungsten_host.in_process():
-        _run_native(arguments)
+        _run_native(native_arguments)
+    _render_scenes(options, host)
 
-    warm_start = load_warm_start(options)
-    settings = fit_settings(options, (*FIT_OPTIONS, "threads"), warm_start)
-    denoise, seeds = None, [options.seed] * len(options.scenes)
+
+def _render_scenes(options: Options, host: str) -> None:
+    """Render every scene in this process, and denoise it if that is asked for.
+
+    Raises InputError in the end if any of several scenes failed.
+    """
+    warm_start = load_warm_start(options.warm_start)
+    settings = fit_settings(vars(options), (*FIT_OPTIONS, "threads"), warm_start)
+    count = len(options.scenes)
+    denoise, seeds = None, [options.seed] * count
     if options.dip_denoise:
         check_ready(settings, warm_start)
-        if len(options.scenes) > 1 and settings.preset != "paper":
+        if count > 1 and settings.preset != "paper":
             denoise = _frame_after_frame(settings, warm_start)
             # The same noise in every frame would not average out.
             first = options.seed or 0
-            seeds = [options.seed, *((first + index) % 2**32 for index in range(1, len(seeds)))]
+            seeds = [options.seed, *((first + index) % 2**32 for index in range(1, count))]
         else:
             denoise = _each_alone(settings, warm_start)
-    count = len(options.scenes)
     taken: set[Path] = set()
 
     def check(path_and_seed: tuple[Path, int | None]) -> _Job:
         path, seed = path_and_seed
-        of_scene = argparse.Namespace(**{**vars(options), "seed": seed})
         scene = load_scene(path, options.input_directory)
-        return _Job(scene, _checked_outputs(scene, of_scene, taken), of_scene)
+        return _Job(scene, _checked_outputs(scene, options, taken), replace(options, seed=seed))
 
     # All of them first: what is wrong with the last one is not to be told after hours of rendering.
     jobs = _succeeded(check, zip(options.scenes, seeds, strict=True), count == 1)
@@ -193,63 +181,6 @@ def _run_native(arguments: Sequence[str]) -> NoReturn:
     os.execve(command, ["tungsten", *arguments], native.environment())
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="tungsten", description="Render scenes in Tungsten's format, and denoise them.")
-    add = parser.add_argument
-    add("scenes", metavar="scene", type=Path, nargs="*", help="scene files (JSON)")
-    add("-v", "--version", action="version", version=f"tungsten, version {tungsten_dip.__version__}")
-    add("-t", "--threads", metavar="N", type=int, help="number of threads")
-    add("-r", "--restart", action="store_true", help="ignore saved render checkpoints and start from 0 spp")
-    add(
-        "-c",
-        "--checkpoint",
-        metavar="TIME",
-        type=minutes,
-        help="minutes between checkpoints, or 90s, 2h; 0: none",
-    )
-    add("-i", "--input-directory", metavar="DIR", type=Path, help="where the files of the scenes are")
-    add("-d", "--output-directory", metavar="DIR", type=Path, help="where output goes; made if need be")
-    add("--spp", metavar="N", type=int, help="samples per pixel in place of the scene's")
-    add(
-        "--timeout",
-        metavar="TIME",
-        type=minutes,
-        help="render for so many minutes at most, or 90s, 2h; 0: no limit",
-    )
-    add("-s", "--seed", metavar="N", type=int, help="random seed of the render")
-    add("-o", "--output-file", metavar="FILE", type=Path, help="PNG in place of the scene's output_file")
-    add("-e", "--hdr-output-file", metavar="FILE", type=Path, help="EXR, PFM or HDR in place of the scene's")
-    add(
-        "--host",
-        choices=get_args(Host),
-        default="auto",
-        help="who renders (auto: Tungsten if it was built in)",
-    )
-    dip = parser.add_argument_group("denoising")
-    dip.add_argument(
-        "--dip-denoise", action="store_true", help="denoise the picture with a network fitted to it"
-    )
-    add_fit_options(dip, prefix="dip-")
-    dip.add_argument(
-        "--dip-preview",
-        action="store_true",
-        help="denoise quickly every minute, or at the checkpoints, as <stem>_preview.png (with Tungsten)",
-    )
-    dip.add_argument("--dip-report", dest="report", metavar="R.html", type=Path, help=REPORT_HELP)
-    return parser
-
-
-def _stock_arguments(arguments: Sequence[str]) -> list[str]:
-    """Return the command line without ``--host``, which the stock command does not have."""
-    stock, rest = [], iter(arguments)
-    for argument in rest:
-        if argument == "--host":
-            next(rest)
-        elif not argument.startswith("--host="):
-            stock.append(argument)
-    return stock
-
-
 def _render_scene(job: _Job, host: str, settings: FitSettings, denoise: Denoise | None) -> None:
     """Render one scene, write its files, then denoise: an interrupted fit leaves the render's files.
 
@@ -271,7 +202,7 @@ def _render_scene(job: _Job, host: str, settings: FitSettings, denoise: Denoise 
             write_outputs(result, buffers, outputs, tonemap, options.report, remarks, options.save_model)
 
 
-def _checked_outputs(scene: Scene, options: argparse.Namespace, taken: set[Path]) -> SceneOutputs:
+def _checked_outputs(scene: Scene, options: Options, taken: set[Path]) -> SceneOutputs:
     """Return what a scene writes.
 
     ``taken`` are the files of the scenes before, to which this one's are added, with what is made of the
@@ -299,7 +230,7 @@ def _checked_outputs(scene: Scene, options: argparse.Namespace, taken: set[Path]
     for file in own:
         check_writable(file, file.suffix)
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
-    check_no_input(sorted(rendered | derived), {file.resolve() for file in scene.files})
+    check_outputs_are_not_inputs(sorted(rendered | derived), {file.resolve() for file in scene.files})
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")
@@ -320,7 +251,7 @@ def _checked_outputs(scene: Scene, options: argparse.Namespace, taken: set[Path]
 def _render_with_tungsten(
     scene: Scene,
     outputs: SceneOutputs,
-    options: argparse.Namespace,
+    options: Options,
     settings: FitSettings,
     progress: Progress,
 ) -> tuple[RenderBuffers, SceneOutputs]:
@@ -393,9 +324,7 @@ def _preview(outputs: SceneOutputs, settings: FitSettings) -> Callable[[tungsten
     return write
 
 
-def _driver_options(
-    options: argparse.Namespace, scene: Scene, outputs: SceneOutputs
-) -> tungsten_host.DriverOptions:
+def _driver_options(options: Options, scene: Scene, outputs: SceneOutputs) -> tungsten_host.DriverOptions:
     asked_ldr = options.output_file or scene.renderer.output_file
     asked_hdr = options.hdr_output_file or scene.renderer.hdr_output_file
     return tungsten_host.DriverOptions(
@@ -413,15 +342,14 @@ def _driver_options(
     )
 
 
-def _checkpoint_interval(scene: Scene, options: argparse.Namespace) -> float | None:
+def _checkpoint_interval(scene: Scene, options: Options) -> float | None:
     """Return the seconds between checkpoints, None as the scene has it."""
     if options.dip_preview and options.checkpoint is None and not _seconds(scene, "checkpoint_interval"):
         return _PREVIEW_INTERVAL_S
-    checkpoint: float | None = options.checkpoint
-    return checkpoint
+    return options.checkpoint
 
 
-def _render_with_mitsuba(scene: Scene, options: argparse.Namespace, progress: Progress) -> RenderBuffers:
+def _render_with_mitsuba(scene: Scene, options: Options, progress: Progress) -> RenderBuffers:
     if scene.renderer.enable_resume_render:
         _LOG.warning("%s: asks to resume; Mitsuba saves no state and starts from 0 spp", scene.path)
     wanted = {"color", *(request.type for request in scene.renderer.output_buffers)}

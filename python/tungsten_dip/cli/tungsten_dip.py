@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from tungsten_dip.cli.denoising import (
     add_file_options,
     add_fit_options,
     add_map,
-    check_no_input,
+    check_outputs_are_not_inputs,
     denoise_with_progress,
     fit_settings,
     layer_mapping,
@@ -43,6 +43,7 @@ from tungsten_dip.cli.denoising import (
     warn_of_little_memory,
     write_model,
 )
+from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.cli.sequence import add_sequence
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
@@ -65,15 +66,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None) -> None:
     options = _parser().parse_args(arguments)
     with json_on_stdout(options.json) as emit:
-        facts, text = options.action(options)
+        outcome: Outcome = options.action(options)
         with writing_stdout():
             if options.json:
-                emit(facts)
+                emit(outcome.facts)
             else:
-                _print(text)
-    if "error" in facts:
-        raise InputError(facts["error"])
-    if facts.get("interrupted"):
+                _print(outcome.text)
+    if outcome.error is not None:
+        raise InputError(outcome.error)
+    if outcome.interrupted:
         raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
 
 
@@ -153,10 +154,10 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
     add("--report", metavar="R.html", type=Path, help=REPORT_HELP)
 
 
-def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    warm_start = load_warm_start(options)
+def _denoise(options: argparse.Namespace) -> Outcome:
+    warm_start = load_warm_start(options.warm_start)
     names = (*FIT_OPTIONS, "iterations", "seed", "threads", *PAPER_SETTINGS)
-    settings = fit_settings(options, names, warm_start)
+    settings = fit_settings(vars(options), names, warm_start)
     check_ready(settings, warm_start)
 
     def fit(buffers: RenderBuffers) -> FitResult:
@@ -166,7 +167,7 @@ def _denoise(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return _denoised(options, settings.preset, fit)
 
 
-def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _infer(options: argparse.Namespace) -> Outcome:
     whole_number("--refit", options.refit, 0, MOST_ITERATIONS)
     if options.save_model is not None and options.refit == 0:
         raise InputError(
@@ -190,7 +191,7 @@ def _infer(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _denoised(
     options: argparse.Namespace, preset: Preset, denoise: Callable[[RenderBuffers], FitResult]
-) -> tuple[dict[str, Any], str]:
+) -> Outcome:
     """Read the buffers, denoise them, write all that the options ask for."""
     if preset == "paper" and options.error_map is not None:
         raise InputError("--error-map: the published method estimates no error; use another preset")
@@ -205,7 +206,9 @@ def _denoised(
     inputs = [file.resolve() for file in input_files(options.input, mapping)]
     # One file that holds everything may be replaced: the result passes all of its layers through.
     is_whole = inputs == [options.input.resolve()]
-    check_no_input([options.error_map] if is_whole else [options.output, options.error_map], inputs)
+    check_outputs_are_not_inputs(
+        [options.error_map] if is_whole else [options.output, options.error_map], inputs
+    )
 
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, mapping)
@@ -236,18 +239,19 @@ def _denoised(
     known = result.estimated_relmse is not None
     error = f", estimated relMSE {result.estimated_relmse:.3g}" if known else ""
     steps = "iteration" if result.iterations == 1 else "iterations"
-    return facts, f"{options.output}: {result.iterations} {steps} in {result.seconds:.1f} s{error}"
+    text = f"{options.output}: {result.iterations} {steps} in {result.seconds:.1f} s{error}"
+    return Outcome(facts, text, interrupted=result.interrupted)
 
 
-def _inspect(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _inspect(options: argparse.Namespace) -> Outcome:
     mapping = layer_mapping(options)
     if options.input.suffix.lower() == ".json" and not mapping:
         scene = load_scene(options.input)
-        return inspect_facts(scene), inspect_text(scene)
+        return Outcome(inspect_facts(scene), inspect_text(scene))
     return _facts_of_buffers(read_buffers(options.input, mapping))
 
 
-def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
+def _facts_of_buffers(buffers: RenderBuffers) -> Outcome:
     spp = None if buffers.spp is None else float(np.mean(buffers.spp))
     quantities = {}
     lines = [
@@ -259,15 +263,11 @@ def _facts_of_buffers(buffers: RenderBuffers) -> tuple[dict[str, Any], str]:
         quantities[name] = {"planes": list(planes), "nonfinite": nonfinite}
         bad = f", {nonfinite} values not finite" if nonfinite else ""
         lines.append(f"{name:<11}{', '.join(planes)}{bad}")
-    return {
-        "width": buffers.width,
-        "height": buffers.height,
-        "spp": spp,
-        "quantities": quantities,
-    }, "\n".join(lines)
+    facts = {"width": buffers.width, "height": buffers.height, "spp": spp, "quantities": quantities}
+    return Outcome(facts, "\n".join(lines))
 
 
-def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _compare(options: argparse.Namespace) -> Outcome:
     image, reference = read_image(options.image), read_image(options.reference)
     if image.shape != reference.shape:
         (height, width), (rows, columns) = image.shape[:2], reference.shape[:2]
@@ -283,4 +283,4 @@ def _compare(options: argparse.Namespace) -> tuple[dict[str, Any], str]:
         )
     facts = asdict(tungsten_dip.compare(image, reference))
     lines = (f"{name:<11}{'-' if value is None else f'{value:.5g}'}" for name, value in facts.items())
-    return facts, "\n".join(lines)
+    return Outcome(facts, "\n".join(lines))
