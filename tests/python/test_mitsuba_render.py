@@ -22,7 +22,7 @@ from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.hosts.mitsuba.render import _scene_with_integrator, _Statistics, render_translated
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
-from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
+from tungsten_dip.hosts.mitsuba.translated_scene import TranslatedScene
 from tungsten_dip.scene.types import PathTracer
 
 mi.set_variant("scalar_rgb")

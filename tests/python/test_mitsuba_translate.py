@@ -24,9 +24,9 @@ from tungsten_dip.hosts.mitsuba.curves import cubic_from_quadratic  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render as render_scene  # noqa: E402
 from tungsten_dip.hosts.mitsuba.render import render_translated  # noqa: E402
 from tungsten_dip.hosts.mitsuba.runtime import mitsuba_variant  # noqa: E402
+from tungsten_dip.hosts.mitsuba.scene_builder import SceneBuilder  # noqa: E402
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels  # noqa: E402
 from tungsten_dip.hosts.mitsuba.translate import translate  # noqa: E402
-from tungsten_dip.hosts.mitsuba.translation import Translation  # noqa: E402
 from tungsten_dip.scene.parse import load_scene  # noqa: E402
 from tungsten_dip.scene.types import Skydome  # noqa: E402
 
@@ -638,7 +638,7 @@ def test_the_sky_has_the_spectrum_and_the_symmetry_of_the_model(folder: Path) ->
     assert isinstance(bright, Skydome)
     assert isinstance(dim, Skydome)
     with mitsuba_variant():
-        pixels, half = (sky_pixels(Translation(load_scene(path)), sky) for sky in (bright, dim))
+        pixels, half = (sky_pixels(SceneBuilder(load_scene(path)), sky) for sky in (bright, dim))
     np.testing.assert_allclose(pixels, 1.5 * half)
     np.testing.assert_allclose(pixels[:128], np.broadcast_to(pixels[:128, :1], (128, 512, 3)), rtol=1e-6)
     assert (pixels[64, 0, 2] > pixels[64, 0, 0]).all()  # blue

@@ -9,8 +9,8 @@ import logging
 from collections.abc import Callable
 from typing import Any, Literal
 
+from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, constant
 from tungsten_dip.hosts.mitsuba.textures import UV, slopes_node, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.types import Matrix
 
@@ -32,7 +32,7 @@ BentShape = Literal["mesh", "cube", "quad"]
 
 
 def bsdf_object(
-    t: Translation,
+    builder: SceneBuilder,
     bsdf: ts.Bsdf,
     uv: Matrix = UV,
     *,
@@ -48,26 +48,29 @@ def bsdf_object(
     """
     heights = height_map(bsdf)
     key = ("bsdf", bsdf, uv.tobytes().hex(), None if heights is None else shape, faces_viewer)
-    found = t.made(key)
+    found = builder.made(key)
     if found is not None:
         return found
-    outer, t.place = t.place, f"{t.place}, {_named(bsdf)}" if t.place else _named(bsdf)
-    node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(t, bsdf, uv)
+    outer, builder.place = (
+        builder.place,
+        f"{builder.place}, {_named(bsdf)}" if builder.place else _named(bsdf),
+    )
+    node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(builder, bsdf, uv)
     if heights is not None:
         if shape is None:
-            raise t.unsupported("bump mapping of another shape than a mesh, a quad or a cube")
+            raise builder.unsupported("bump mapping of another shape than a mesh, a quad or a cube")
         # Outside of "twosided": Tungsten turns the bent normal towards the viewer.
         node = {
             "type": "tungsten_bump",
             "nested": node,
-            "slopes": slopes_node(t, heights, uv),
+            "slopes": slopes_node(builder, heights, uv),
             "shape": shape,
-            "consistent": t.source.integrator.enable_consistency_checks,
+            "consistent": builder.source.integrator.enable_consistency_checks,
         }
-    built = t.add("bsdf", node)
-    t.albedo[built.id()] = texture_node(t, bsdf.written_albedo, "rgb", uv)
-    t.place = outer
-    return t.remember(key, built)
+    built = builder.add("bsdf", node)
+    builder.albedo[built.id()] = texture_node(builder, bsdf.written_albedo, "rgb", uv)
+    builder.place = outer
+    return builder.remember(key, built)
 
 
 def height_map(bsdf: ts.Bsdf) -> ts.Texture | None:
@@ -116,110 +119,119 @@ def _scatters(bsdf: ts.Bsdf) -> bool:
     )
 
 
-def _node(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+def _node(builder: SceneBuilder, bsdf: ts.Bsdf, uv: Matrix) -> Node:
     if isinstance(bsdf, ts.TransparencyBsdf):
         if isinstance(bsdf.base, _LETS_THROUGH):
-            raise t.unsupported(f"a transparency over a BSDF that lets light through ({bsdf.base.kind})")
+            raise builder.unsupported(
+                f"a transparency over a BSDF that lets light through ({bsdf.base.kind})"
+            )
         # The mask comes outside: what is behind "twosided" must not transmit.
-        opacity = texture_node(t, bsdf.alpha, "alpha_or_average", uv)
-        return {"type": "mask", "opacity": opacity, "nested": _node(t, bsdf.base, uv)}
-    one_sided = _one_sided(t, bsdf, uv)
+        opacity = texture_node(builder, bsdf.alpha, "alpha_or_average", uv)
+        return {"type": "mask", "opacity": opacity, "nested": _node(builder, bsdf.base, uv)}
+    one_sided = _one_sided(builder, bsdf, uv)
     has_both_sides = _transmits(bsdf) or isinstance(bsdf, ts.ThinSheetBsdf | ts.ForwardBsdf)
     # A mirror reflects on both sides of its own accord.
-    turned = t.source.integrator.enable_two_sided_shading or isinstance(bsdf, ts.MirrorBsdf)
+    turned = builder.source.integrator.enable_two_sided_shading or isinstance(bsdf, ts.MirrorBsdf)
     return one_sided if has_both_sides or not turned else {"type": "twosided", "nested": one_sided}
 
 
-def _one_sided(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Node:
+def _one_sided(builder: SceneBuilder, bsdf: ts.Bsdf, uv: Matrix) -> Node:
     translate = _TRANSLATORS.get(type(bsdf))
     if translate is None:
-        raise t.unsupported(f"a BSDF of type {bsdf.kind}")
-    return translate(t, bsdf, uv)
+        raise builder.unsupported(f"a BSDF of type {bsdf.kind}")
+    return translate(builder, bsdf, uv)
 
 
-def _albedo(t: Translation, bsdf: ts.Bsdf, uv: Matrix) -> Any:
-    return texture_node(t, bsdf.albedo, "rgb", uv)
+def _albedo(builder: SceneBuilder, bsdf: ts.Bsdf, uv: Matrix) -> Any:
+    return texture_node(builder, bsdf.albedo, "rgb", uv)
 
 
-def _lambert(t: Translation, bsdf: ts.LambertBsdf, uv: Matrix) -> Node:
-    return {"type": "diffuse", "reflectance": _albedo(t, bsdf, uv)}
+def _lambert(builder: SceneBuilder, bsdf: ts.LambertBsdf, uv: Matrix) -> Node:
+    return {"type": "diffuse", "reflectance": _albedo(builder, bsdf, uv)}
 
 
-def _oren_nayar(t: Translation, bsdf: ts.OrenNayarBsdf, uv: Matrix) -> Node:
-    roughness = texture_node(t, bsdf.roughness, "average", uv)
-    return {"type": "tungsten_oren_nayar", "albedo": _albedo(t, bsdf, uv), "roughness": roughness}
+def _oren_nayar(builder: SceneBuilder, bsdf: ts.OrenNayarBsdf, uv: Matrix) -> Node:
+    roughness = texture_node(builder, bsdf.roughness, "average", uv)
+    return {"type": "tungsten_oren_nayar", "albedo": _albedo(builder, bsdf, uv), "roughness": roughness}
 
 
-def _phong(t: Translation, bsdf: ts.PhongBsdf, uv: Matrix) -> Node:
+def _phong(builder: SceneBuilder, bsdf: ts.PhongBsdf, uv: Matrix) -> Node:
     return {
         "type": "tungsten_phong",
-        "albedo": _albedo(t, bsdf, uv),
+        "albedo": _albedo(builder, bsdf, uv),
         "exponent": bsdf.exponent,
         "diffuse_ratio": bsdf.diffuse_ratio,
     }
 
 
-def _mirror(t: Translation, bsdf: ts.MirrorBsdf, uv: Matrix) -> Node:
-    return {"type": "conductor", "material": "none", "specular_reflectance": _albedo(t, bsdf, uv)}
+def _mirror(builder: SceneBuilder, bsdf: ts.MirrorBsdf, uv: Matrix) -> Node:
+    return {"type": "conductor", "material": "none", "specular_reflectance": _albedo(builder, bsdf, uv)}
 
 
-def _conductor(t: Translation, bsdf: ts.ConductorBsdf | ts.RoughConductorBsdf, uv: Matrix) -> Node:
+def _conductor(builder: SceneBuilder, bsdf: ts.ConductorBsdf | ts.RoughConductorBsdf, uv: Matrix) -> Node:
     node = {
         "type": "conductor",
         "eta": constant(bsdf.eta),
         "k": constant(bsdf.k),
-        "specular_reflectance": _albedo(t, bsdf, uv),
+        "specular_reflectance": _albedo(builder, bsdf, uv),
     }
     if isinstance(bsdf, ts.RoughConductorBsdf):
-        node |= {"type": "roughconductor", **_microfacets(t, bsdf, uv)}
+        node |= {"type": "roughconductor", **_microfacets(builder, bsdf, uv)}
     return node
 
 
-def _dielectric(t: Translation, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
+def _dielectric(builder: SceneBuilder, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
     if not bsdf.enable_refraction:
-        return _reflecting_glass(t, bsdf, uv)
-    return {"type": "dielectric", **_refraction(t, bsdf, uv)}
+        return _reflecting_glass(builder, bsdf, uv)
+    return {"type": "dielectric", **_refraction(builder, bsdf, uv)}
 
 
 _LEAST_BEND = 1e-4
 
 
-def _rough_dielectric(t: Translation, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+def _rough_dielectric(builder: SceneBuilder, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
     if not bsdf.enable_refraction:
-        return _reflecting_glass(t, bsdf, uv) | {"type": "roughconductor", **_microfacets(t, bsdf, uv)}
-    node = {"type": "roughdielectric", **_refraction(t, bsdf, uv), **_microfacets(t, bsdf, uv)}
+        return _reflecting_glass(builder, bsdf, uv) | {
+            "type": "roughconductor",
+            **_microfacets(builder, bsdf, uv),
+        }
+    node = {"type": "roughdielectric", **_refraction(builder, bsdf, uv), **_microfacets(builder, bsdf, uv)}
     # Mitsuba's has no half-vectors where nothing is bent, and refuses.
     return node | {"int_ior": bsdf.ior if abs(bsdf.ior - 1) > _LEAST_BEND else 1 + _LEAST_BEND}
 
 
-def _reflecting_glass(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+def _reflecting_glass(
+    builder: SceneBuilder, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix
+) -> Node:
     """Glass that reflects alone: a metal that does not absorb."""
     return {
         "type": "conductor",
         "eta": constant(bsdf.ior),
         "k": constant(0.0),
-        "specular_reflectance": _albedo(t, bsdf, uv),
+        "specular_reflectance": _albedo(builder, bsdf, uv),
     }
 
 
-def _refraction(t: Translation, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+def _refraction(builder: SceneBuilder, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
     return {
         "int_ior": bsdf.ior,
         "ext_ior": 1.0,
-        "specular_reflectance": _albedo(t, bsdf, uv),
-        "specular_transmittance": _albedo(t, bsdf, uv),
+        "specular_reflectance": _albedo(builder, bsdf, uv),
+        "specular_transmittance": _albedo(builder, bsdf, uv),
     }
 
 
-def _microfacets(t: Translation, bsdf: ts.RoughConductorBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
+def _microfacets(
+    builder: SceneBuilder, bsdf: ts.RoughConductorBsdf | ts.RoughDielectricBsdf, uv: Matrix
+) -> Node:
     if bsdf.distribution == "phong":
-        raise t.unsupported(f"a {bsdf.kind} of distribution phong")
-    alpha = texture_node(t, bsdf.roughness, "average", uv, least=_SMALLEST_ALPHA)
+        raise builder.unsupported(f"a {bsdf.kind} of distribution phong")
+    alpha = texture_node(builder, bsdf.roughness, "average", uv, least=_SMALLEST_ALPHA)
     return {"distribution": bsdf.distribution, "alpha": alpha}
 
 
-def _rough_layer(t: Translation, bsdf: ts.RoughPlasticBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
-    roughness = texture_node(t, bsdf.roughness, "average", uv)
+def _rough_layer(builder: SceneBuilder, bsdf: ts.RoughPlasticBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
+    roughness = texture_node(builder, bsdf.roughness, "average", uv)
     return {"roughness": roughness, "distribution": bsdf.distribution}
 
 
@@ -232,34 +244,34 @@ def _layer(
     }
 
 
-def _plastic(t: Translation, bsdf: ts.PlasticBsdf | ts.RoughPlasticBsdf, uv: Matrix) -> Node:
-    node = {"type": "tungsten_plastic", "albedo": _albedo(t, bsdf, uv), **_layer(bsdf)}
-    return node | _rough_layer(t, bsdf, uv) if isinstance(bsdf, ts.RoughPlasticBsdf) else node
+def _plastic(builder: SceneBuilder, bsdf: ts.PlasticBsdf | ts.RoughPlasticBsdf, uv: Matrix) -> Node:
+    node = {"type": "tungsten_plastic", "albedo": _albedo(builder, bsdf, uv), **_layer(bsdf)}
+    return node | _rough_layer(builder, bsdf, uv) if isinstance(bsdf, ts.RoughPlasticBsdf) else node
 
 
-def _coat(t: Translation, bsdf: ts.SmoothCoatBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
+def _coat(builder: SceneBuilder, bsdf: ts.SmoothCoatBsdf | ts.RoughCoatBsdf, uv: Matrix) -> Node:
     substrate = bsdf.substrate
     if _transmits(substrate) or isinstance(substrate, _LETS_THROUGH):
-        raise t.unsupported(f"a {bsdf.kind} over a BSDF that transmits ({substrate.kind})")
-    node = {"type": "tungsten_coat", "nested": _one_sided(t, substrate, uv), **_layer(bsdf)}
-    return node | _rough_layer(t, bsdf, uv) if isinstance(bsdf, ts.RoughCoatBsdf) else node
+        raise builder.unsupported(f"a {bsdf.kind} over a BSDF that transmits ({substrate.kind})")
+    node = {"type": "tungsten_coat", "nested": _one_sided(builder, substrate, uv), **_layer(bsdf)}
+    return node | _rough_layer(builder, bsdf, uv) if isinstance(bsdf, ts.RoughCoatBsdf) else node
 
 
-def _thinsheet(t: Translation, bsdf: ts.ThinSheetBsdf, uv: Matrix) -> Node:
+def _thinsheet(builder: SceneBuilder, bsdf: ts.ThinSheetBsdf, uv: Matrix) -> Node:
     return {
         "type": "tungsten_thinsheet",
         "ior": bsdf.ior,
         "interference": bsdf.enable_interference,
-        "thickness": texture_node(t, bsdf.thickness, "average", uv),
+        "thickness": texture_node(builder, bsdf.thickness, "average", uv),
         "sigma_a": {"type": "rgb", "value": list(bsdf.sigma_a)},
     }
 
 
-def _diffuse_transmission(t: Translation, bsdf: ts.DiffuseTransmissionBsdf, uv: Matrix) -> Node:
-    return {"type": "tungsten_diffuse_transmission", "albedo": _albedo(t, bsdf, uv)}
+def _diffuse_transmission(builder: SceneBuilder, bsdf: ts.DiffuseTransmissionBsdf, uv: Matrix) -> Node:
+    return {"type": "tungsten_diffuse_transmission", "albedo": _albedo(builder, bsdf, uv)}
 
 
-def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
+def _mixed(builder: SceneBuilder, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
     parts = (bsdf.bsdf0, bsdf.bsdf1)
     for part in parts:
         if isinstance(part, ts.MirrorBsdf | ts.ConductorBsdf | ts.DielectricBsdf):
@@ -267,26 +279,26 @@ def _mixed(t: Translation, bsdf: ts.MixedBsdf, uv: Matrix) -> Node:
             _LOG.warning(
                 "%s: %s: a mixed BSDF with a specular part (%s) is darker than Tungsten's by up to a sixth; "
                 "for the same picture render with --host tungsten",
-                t.source.path, t.place, part.kind,
+                builder.source.path, builder.place, part.kind,
             )  # fmt: skip
         elif not _scatters(part):
-            raise t.unsupported(f"a mixed BSDF of a {part.kind}")
+            raise builder.unsupported(f"a mixed BSDF of a {part.kind}")
     if all(isinstance(part, ts.PlasticBsdf | ts.SmoothCoatBsdf) for part in parts):
-        raise t.unsupported("a mixed BSDF of two smooth layers")
+        raise builder.unsupported("a mixed BSDF of two smooth layers")
     return {
         "type": "tungsten_mixed",
-        "ratio": texture_node(t, bsdf.ratio, "average", uv),
-        "albedo": _albedo(t, bsdf, uv),
-        "bsdf_0": _one_sided(t, bsdf.bsdf0, uv),
-        "bsdf_1": _one_sided(t, bsdf.bsdf1, uv),
+        "ratio": texture_node(builder, bsdf.ratio, "average", uv),
+        "albedo": _albedo(builder, bsdf, uv),
+        "bsdf_0": _one_sided(builder, bsdf.bsdf0, uv),
+        "bsdf_1": _one_sided(builder, bsdf.bsdf1, uv),
     }
 
 
-def _null(t: Translation, bsdf: ts.NullBsdf, uv: Matrix) -> Node:
+def _null(builder: SceneBuilder, bsdf: ts.NullBsdf, uv: Matrix) -> Node:
     return {"type": "diffuse", "reflectance": constant(0.0)}
 
 
-def _forward(t: Translation, bsdf: ts.ForwardBsdf, uv: Matrix) -> Node:
+def _forward(builder: SceneBuilder, bsdf: ts.ForwardBsdf, uv: Matrix) -> Node:
     return {"type": "null"}
 
 
@@ -307,7 +319,7 @@ def _hair(bsdf: ts.HairBsdf, faces_viewer: bool) -> Node:
     }
 
 
-_TRANSLATORS: dict[type[ts.Bsdf], Callable[[Translation, Any, Matrix], Node]] = {
+_TRANSLATORS: dict[type[ts.Bsdf], Callable[[SceneBuilder, Any, Matrix], Node]] = {
     ts.LambertBsdf: _lambert,
     ts.OrenNayarBsdf: _oren_nayar,
     ts.PhongBsdf: _phong,

@@ -11,31 +11,31 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.bsdfs import bsdf_object
+from tungsten_dip.hosts.mitsuba.scene_builder import SceneBuilder
 from tungsten_dip.hosts.mitsuba.textures import is_constant, shines
-from tungsten_dip.hosts.mitsuba.translation import Translation
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import curve_geometry
 
 _Array = npt.NDArray[np.float64]
 
 
-def curve_shapes(t: Translation, primitive: ts.Curves) -> list[Any]:
+def curve_shapes(builder: SceneBuilder, primitive: ts.Curves) -> list[Any]:
     """Return the shape of all curves of a primitive.
 
     Raises InputError for ribbons, and for surfaces that need UV or a normal that only Tungsten has.
     """
     faces_viewer = primitive.mode == "bcsdf_cylinder"
     if primitive.mode == "ribbon":
-        raise t.unsupported("curves of mode ribbon")
+        raise builder.unsupported("curves of mode ribbon")
     if faces_viewer and not isinstance(primitive.bsdf, ts.HairBsdf):
-        raise t.unsupported(f"a BSDF of type {primitive.bsdf.kind} on curves of mode bcsdf_cylinder")
-    if shines(t, primitive):
-        raise t.unsupported("shining curves")
+        raise builder.unsupported(f"a BSDF of type {primitive.bsdf.kind} on curves of mode bcsdf_cylinder")
+    if shines(builder, primitive):
+        raise builder.unsupported("shining curves")
     if primitive.int_medium is not None or primitive.ext_medium is not None:
-        raise t.unsupported("curves with a medium")
+        raise builder.unsupported("curves with a medium")
     textures = [value for value in vars(primitive.bsdf).values() if isinstance(value, ts.Texture)]
     if not all(is_constant(texture) for texture in textures):
-        raise t.unsupported("a texture on curves")
+        raise builder.unsupported("a texture on curves")
 
     curves = curve_geometry(primitive)
     nodes = curves.nodes.astype(np.float64)
@@ -49,7 +49,7 @@ def curve_shapes(t: Translation, primitive: ts.Curves) -> list[Any]:
     if not len(first):
         return []
     control_points = cubic_from_quadratic(nodes[first], nodes[first + 1], nodes[first + 2])
-    surface = bsdf_object(t, primitive.bsdf, faces_viewer=faces_viewer)
+    surface = bsdf_object(builder, primitive.bsdf, faces_viewer=faces_viewer)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "curves.txt"
         # A line for every control point, an empty one after every segment.

@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, constant, transform
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
 from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant, transform
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.types import Matrix
 
@@ -23,13 +23,13 @@ Surrounding = ts.InfiniteSphere | ts.InfiniteSphereCap | ts.Skydome
 _ENVMAP_AXES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
-def point_node(t: Translation, primitive: ts.Point) -> Node | None:
+def point_node(builder: SceneBuilder, primitive: ts.Point) -> Node | None:
     """Return Mitsuba's point light, or None where it does not shine."""
     texture = primitive.emitter
-    if texture is None or not shines(t, primitive):
+    if texture is None or not shines(builder, primitive):
         return None
     if not isinstance(texture, ts.ConstantTexture):
-        raise t.unsupported(f"a point light with a texture of type {texture.kind}")
+        raise builder.unsupported(f"a point light with a texture of type {texture.kind}")
     scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
     return {
         "type": "point",
@@ -38,26 +38,28 @@ def point_node(t: Translation, primitive: ts.Point) -> Node | None:
     }
 
 
-def environment_node(t: Translation, primitive: Surrounding) -> Node | None:
+def environment_node(builder: SceneBuilder, primitive: Surrounding) -> Node | None:
     """Return the Mitsuba emitter of a light that surrounds the scene, or None where it does not shine.
 
     Raises InputError for a texture without counterpart.
     """
-    if not shines(t, primitive):
+    if not shines(builder, primitive):
         return None
     if isinstance(primitive, ts.Skydome):
-        return envmap_node(sky_pixels(t, primitive), np.eye(3))
+        return envmap_node(sky_pixels(builder, primitive), np.eye(3))
     texture = primitive.emitter
     assert texture is not None
     if isinstance(primitive, ts.InfiniteSphereCap):
-        return _cap(t, primitive, texture)
+        return _cap(builder, primitive, texture)
     scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
     if isinstance(texture, ts.ConstantTexture):
         return {"type": "constant", "radiance": constant(_scaled(texture.value, scale))}
     if isinstance(texture, ts.BitmapTexture) and texture.interpolate:
-        pixels = bitmap_pixels(t, texture, "rgb") * (scale * texture.scale)
-        return envmap_node(pixels, _rotation(t, primitive.world_from_local), clamp=texture.clamp)
-    raise t.unsupported(f"an infinite_sphere with a texture of type {texture.kind} (or not interpolated)")
+        pixels = bitmap_pixels(builder, texture, "rgb") * (scale * texture.scale)
+        return envmap_node(pixels, _rotation(builder, primitive.world_from_local), clamp=texture.clamp)
+    raise builder.unsupported(
+        f"an infinite_sphere with a texture of type {texture.kind} (or not interpolated)"
+    )
 
 
 def default_environment() -> Node:
@@ -101,7 +103,7 @@ def envmap_node(
     }
 
 
-def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node | None:
+def _cap(builder: SceneBuilder, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -> Node | None:
     if primitive.cap_angle == 0.0:
         return None
     angle = math.radians(primitive.cap_angle)
@@ -114,14 +116,14 @@ def _cap(t: Translation, primitive: ts.InfiniteSphereCap, texture: ts.Texture) -
         "type": "tungsten_cap",
         "direction": [float(x) for x in primitive.world_from_local[:3, 1]],
         "cap_angle": angle,
-        "radiance": texture_node(t, texture, "rgb", scale=scale),
+        "radiance": texture_node(builder, texture, "rgb", scale=scale),
     }
 
 
-def _rotation(t: Translation, matrix: Matrix) -> npt.NDArray[np.float64]:
+def _rotation(builder: SceneBuilder, matrix: Matrix) -> npt.NDArray[np.float64]:
     axes = np.asarray(matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0))
     if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-3):
-        raise t.unsupported("a sheared transform")
+        raise builder.unsupported("a sheared transform")
     return axes
 
 

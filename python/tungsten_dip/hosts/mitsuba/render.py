@@ -28,7 +28,7 @@ from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.hosts.memory import check_fits_mitsuba
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
-from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
+from tungsten_dip.hosts.mitsuba.translated_scene import TranslatedScene
 from tungsten_dip.hosts.options import checked_option
 from tungsten_dip.interrupts import wait_in_short_turns
 from tungsten_dip.progress import Progress, part_of, silent

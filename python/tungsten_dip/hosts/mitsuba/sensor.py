@@ -9,26 +9,26 @@ from __future__ import annotations
 import numpy as np
 
 from tungsten_dip.hosts.mitsuba.media import medium_object
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation, transform
+from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, transform
 from tungsten_dip.scene import types as ts
 
 # The rays of Mitsuba's cameras start and end here, in scene units; Tungsten's have no such limits.
 _NEAR, _FAR = 1e-4, 1e7
 
 
-def sensor_node(t: Translation, camera: ts.Camera) -> Node:
+def sensor_node(builder: SceneBuilder, camera: ts.Camera) -> Node:
     """Return the Mitsuba sensor of a camera, with its film.
 
     Raises InputError for a type of camera or a lens without counterpart.
     """
-    t.place = f"camera of type {camera.kind}"
+    builder.place = f"camera of type {camera.kind}"
     if not isinstance(camera, ts.PerspectiveCamera):
-        raise t.unsupported("this camera")
+        raise builder.unsupported("this camera")
     width, height = camera.resolution
     node: Node = {
         "fov": camera.fov,
         "fov_axis": "x",
-        "to_world": transform(_rigid(t, camera.world_from_local) @ np.diag([-1.0, 1.0, 1.0, 1.0])),
+        "to_world": transform(_rigid(builder, camera.world_from_local) @ np.diag([-1.0, 1.0, 1.0, 1.0])),
         "near_clip": _NEAR,
         "far_clip": _FAR,
         "film": {
@@ -41,21 +41,21 @@ def sensor_node(t: Translation, camera: ts.Camera) -> Node:
         },
     }
     if camera.medium is not None:
-        node["medium"] = medium_object(t, camera.medium)
+        node["medium"] = medium_object(builder, camera.medium)
     if not isinstance(camera, ts.ThinlensCamera) or camera.aperture_size == 0.0:
         return {"type": "perspective", **node}
     lens = {"aperture_radius": camera.aperture_size, "focus_distance": camera.focus_distance}
     return {"type": "thinlens", **node, **lens}
 
 
-def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
+def lens_of_integrator(builder: SceneBuilder, camera: ts.Camera) -> dict[str, float]:
     """Return what the integrator is given of a lens that Mitsuba's sensor does not support.
 
     Raises InputError for an aperture without counterpart.
     """
     if not isinstance(camera, ts.ThinlensCamera) or camera.aperture_size == 0.0:
         return {}
-    t.place = f"camera of type {camera.kind}"
+    builder.place = f"camera of type {camera.kind}"
     lens: dict[str, float] = {}
     match camera.aperture:
         case ts.DiskTexture():
@@ -63,18 +63,18 @@ def lens_of_integrator(t: Translation, camera: ts.Camera) -> dict[str, float]:
         case ts.BladeTexture():
             lens = {"lens_blades": camera.aperture.blades, "lens_angle": camera.aperture.angle}
         case _:
-            raise t.unsupported(f"an aperture of type {camera.aperture.kind}")
+            raise builder.unsupported(f"an aperture of type {camera.aperture.kind}")
     if camera.cateye > 0.0:
         lens["lens_radius"] = camera.aperture_size
         lens["diaphragm_distance"] = camera.cateye * camera.plane_distance
     return lens
 
 
-def _rigid(t: Translation, matrix: ts.Matrix) -> ts.Matrix:
+def _rigid(builder: SceneBuilder, matrix: ts.Matrix) -> ts.Matrix:
     """Return the matrix if it neither scales nor shears, cleaned of rounding to two decimals or more."""
     axes = matrix[:3, :3]
     if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-2):
-        raise t.unsupported("a scale in its transform")
+        raise builder.unsupported("a scale in its transform")
     left, _, right = np.linalg.svd(axes)
     rigid = matrix.copy()
     rigid[:3, :3] = left @ right

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from tungsten_dip.hosts.mitsuba.bsdfs import BentShape, bsdf_object, height_map
 from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
+from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, transform
 from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, shines, texture_node
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation, transform
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import mesh_geometry
 from tungsten_dip.scene.types import Matrix
@@ -40,60 +40,62 @@ _LEAST_UV_AREA = 1e-6
 """Twice the area in UV of a triangle below which Tungsten computes no tangents of it."""
 
 
-def add_shapes(t: Translation, primitive: ts.Primitive) -> bool:
+def add_shapes(builder: SceneBuilder, primitive: ts.Primitive) -> bool:
     """Add the shapes that stand for one primitive, and return whether it shines.
 
     Raises InputError for what has no counterpart.
     """
-    for shape in _shapes(t, primitive):
-        t.add("shape", shape)
-    return shines(t, primitive)
+    for shape in _shapes(builder, primitive):
+        builder.add("shape", shape)
+    return shines(builder, primitive)
 
 
-def _shapes(t: Translation, primitive: ts.Primitive) -> list[Any]:
+def _shapes(builder: SceneBuilder, primitive: ts.Primitive) -> list[Any]:
     match primitive:
         case ts.Mesh():
-            return _mesh(t, primitive)
+            return _mesh(builder, primitive)
         case ts.Quad():
-            return [_quad(t, primitive)]
+            return [_quad(builder, primitive)]
         case ts.Cube():
-            return [_cube(t, primitive)]
+            return [_cube(builder, primitive)]
         case ts.Sphere():
-            return [_sphere(t, primitive)]
+            return [_sphere(builder, primitive)]
         case ts.Disk():
-            return [_disk(t, primitive)]
+            return [_disk(builder, primitive)]
         case ts.Cylinder():
-            return _cylinder(t, primitive)
+            return _cylinder(builder, primitive)
         case ts.Curves():
-            return curve_shapes(t, primitive)
+            return curve_shapes(builder, primitive)
         case ts.Instances():
-            return _instances(t, primitive)
-    raise t.unsupported(f"a primitive of type {primitive.kind}")
+            return _instances(builder, primitive)
+    raise builder.unsupported(f"a primitive of type {primitive.kind}")
 
 
-def emission_node(t: Translation, primitive: ts.Primitive, area: float, uv: Matrix = UV) -> Node:
+def emission_node(builder: SceneBuilder, primitive: ts.Primitive, area: float, uv: Matrix = UV) -> Node:
     """Return {"emitter": ...} for a primitive of this area that shines, else {}."""
     texture = primitive.emitter
-    if texture is None or not shines(t, primitive) or area == 0.0:
+    if texture is None or not shines(builder, primitive) or area == 0.0:
         return {}
     scale = 1.0 / (math.pi * area) if primitive.power is not None else 1.0
     if isinstance(primitive, ts.Sphere) and not is_constant(texture):
-        raise t.unsupported("a shining sphere with a texture")
-    return {"emitter": {"type": "tungsten_area", "radiance": texture_node(t, texture, "rgb", uv, scale)}}
+        raise builder.unsupported("a shining sphere with a texture")
+    return {
+        "emitter": {"type": "tungsten_area", "radiance": texture_node(builder, texture, "rgb", uv, scale)}
+    }
 
 
-def _surroundings(t: Translation, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
+def _surroundings(builder: SceneBuilder, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
     """What a shape needs beside its geometry and its light: its BSDF and media."""
-    surface = bsdf_object(t, bsdf, uv, shape=_BENT_SHAPES.get(type(primitive)))
+    surface = bsdf_object(builder, bsdf, uv, shape=_BENT_SHAPES.get(type(primitive)))
     node: Node = {surface.id(): surface}  # Mitsuba renames what it finds under another name
     if primitive.int_medium is not None:
-        node["interior"] = medium_object(t, primitive.int_medium)
+        node["interior"] = medium_object(builder, primitive.int_medium)
     if primitive.ext_medium is not None:
-        node["exterior"] = medium_object(t, primitive.ext_medium)
+        node["exterior"] = medium_object(builder, primitive.ext_medium)
     return node
 
 
-def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
+def _mesh(builder: SceneBuilder, primitive: ts.Mesh) -> list[Any]:
     mesh = mesh_geometry(primitive)
     matrix = primitive.world_from_local
     positions = mesh.positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -105,7 +107,7 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     area = float(0.5 * np.linalg.norm(np.cross(*edges), axis=1).sum())
     if area == 0.0:
         return []
-    emission = emission_node(t, primitive, area)
+    emission = emission_node(builder, primitive, area)
     materials = np.clip(mesh.materials, 0, len(primitive.bsdf) - 1)
     parts = [(bsdf, materials == number) for number, bsdf in enumerate(primitive.bsdf)]
     if any(height_map(bsdf) for bsdf in primitive.bsdf):
@@ -118,7 +120,7 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
         if not part.any():
             continue
         triangles = mesh.triangles[part]
-        node = {**_surroundings(t, primitive, bsdf), **emission}
+        node = {**_surroundings(builder, primitive, bsdf), **emission}
         if emission and normals is not None:
             faces = _triangles({}, positions, triangles, mesh.uvs)
             node["emitter"] = {**emission["emitter"], "faces": faces}
@@ -126,21 +128,21 @@ def _mesh(t: Translation, primitive: ts.Mesh) -> list[Any]:
     return shapes
 
 
-def _quad(t: Translation, primitive: ts.Quad) -> Any:
+def _quad(builder: SceneBuilder, primitive: ts.Quad) -> Any:
     centre, (edge_x, _, edge_z) = primitive.world_from_local[:3, 3], primitive.world_from_local[:3, :3].T
     lengths = np.linalg.norm(edge_x), np.linalg.norm(edge_z)
     if abs(edge_x @ edge_z) > 1e-2 * lengths[0] * lengths[1]:
-        raise t.unsupported("a sheared quad")
+        raise builder.unsupported("a sheared quad")
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions = centre + (uv[:, :1] - 0.5) * edge_x + (uv[:, 1:] - 0.5) * edge_z
     triangles = np.array([[0, 2, 1], [0, 3, 2]])
-    node = _surroundings(t, primitive, primitive.bsdf)
-    node |= emission_node(t, primitive, float(lengths[0] * lengths[1]))
+    node = _surroundings(builder, primitive, primitive.bsdf)
+    node |= emission_node(builder, primitive, float(lengths[0] * lengths[1]))
     return _triangles(node, positions, triangles, uv)
 
 
-def _cube(t: Translation, primitive: ts.Cube) -> Any:
-    centre, rotation, scale = _parts(t, primitive.world_from_local)
+def _cube(builder: SceneBuilder, primitive: ts.Cube) -> Any:
+    centre, rotation, scale = _parts(builder, primitive.world_from_local)
     corner_uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions: list[_Array] = []
     triangles: list[npt.NDArray[Any]] = []
@@ -160,13 +162,13 @@ def _cube(t: Translation, primitive: ts.Cube) -> Any:
     if np.linalg.det(rotation) < 0.0:
         indices = indices[:, ::-1]
     area = 2.0 * float(scale[0] * scale[1] + scale[1] * scale[2] + scale[2] * scale[0])
-    node = _surroundings(t, primitive, primitive.bsdf) | emission_node(t, primitive, area)
+    node = _surroundings(builder, primitive, primitive.bsdf) | emission_node(builder, primitive, area)
     points = centre + (np.concatenate(positions) * scale) @ rotation.T
     return _triangles(node, points, indices, np.concatenate(uv))
 
 
-def _sphere(t: Translation, primitive: ts.Sphere) -> Node:
-    centre, rotation, scale = _parts(t, primitive.world_from_local)
+def _sphere(builder: SceneBuilder, primitive: ts.Sphere) -> Node:
+    centre, rotation, scale = _parts(builder, primitive.world_from_local)
     radius = float(scale.max())
     # Half a turn about z brings Mitsuba's azimuth, which starts at +x, to Tungsten's, which starts at -x.
     axes = radius * (rotation @ np.diag([-1.0, -1.0, 1.0]))
@@ -175,73 +177,73 @@ def _sphere(t: Translation, primitive: ts.Sphere) -> Node:
         "to_world": transform(_affine(axes, centre)),
         # Mirrored, Mitsuba's sphere would be one that is seen from within.
         "flip_normals": bool(np.linalg.det(rotation) < 0.0),
-        **_surroundings(t, primitive, primitive.bsdf),
-        **emission_node(t, primitive, 4.0 * math.pi * radius**2),
+        **_surroundings(builder, primitive, primitive.bsdf),
+        **emission_node(builder, primitive, 4.0 * math.pi * radius**2),
     }
 
 
-def _disk(t: Translation, primitive: ts.Disk) -> Node:
-    centre, rotation, scale = _parts(t, primitive.world_from_local)
+def _disk(builder: SceneBuilder, primitive: ts.Disk) -> Node:
+    centre, rotation, scale = _parts(builder, primitive.world_from_local)
     radius = float(max(scale[0], scale[2]))
-    emission = emission_node(t, primitive, math.pi * radius**2, _DISK_UV)
+    emission = emission_node(builder, primitive, math.pi * radius**2, _DISK_UV)
     if emission and primitive.cone_angle != 90.0:
-        raise t.unsupported("a shining disk with a cone_angle")
+        raise builder.unsupported("a shining disk with a cone_angle")
     tangent, bitangent = _tangent_frame(rotation[:, 1])
     axes = radius * np.stack([-bitangent, -tangent, rotation[:, 1]], axis=1)
     return {
         "type": "disk",
         "to_world": transform(_affine(axes, centre)),
-        **_surroundings(t, primitive, primitive.bsdf, _DISK_UV),
+        **_surroundings(builder, primitive, primitive.bsdf, _DISK_UV),
         **emission,
     }
 
 
-def _cylinder(t: Translation, primitive: ts.Cylinder) -> list[Node]:
-    centre, rotation, scale = _parts(t, primitive.world_from_local)
+def _cylinder(builder: SceneBuilder, primitive: ts.Cylinder) -> list[Node]:
+    centre, rotation, scale = _parts(builder, primitive.world_from_local)
     radius, height = 0.5 * float(max(scale[0], scale[2])), float(scale[1])
     x, y, z = rotation.T
     # Tungsten counts the caps whether they are there or not.
     area = 2.0 * math.pi * radius * (radius + height)
-    emission = emission_node(t, primitive, area, _CYLINDER_UV)
+    emission = emission_node(builder, primitive, area, _CYLINDER_UV)
     if emission and not primitive.capped:
-        raise t.unsupported("a shining cylinder without caps")
+        raise builder.unsupported("a shining cylinder without caps")
     side = _affine(np.stack([-radius * x, radius * z, height * y], axis=1), centre - 0.5 * height * y)
     shapes: list[Node] = [
         {
             "type": "cylinder",
             "to_world": transform(side),
-            **_surroundings(t, primitive, primitive.bsdf, _CYLINDER_UV),
+            **_surroundings(builder, primitive, primitive.bsdf, _CYLINDER_UV),
             **emission,
         }
     ]
     if primitive.capped:
         if not _is_uniform(primitive):
-            raise t.unsupported("a texture on a cylinder with caps")
+            raise builder.unsupported("a texture on a cylinder with caps")
         for sign in (-1.0, 1.0):
             axes = radius * np.stack([x, -sign * z, sign * y], axis=1)
             shapes.append(
                 {
                     "type": "disk",
                     "to_world": transform(_affine(axes, centre + 0.5 * sign * height * y)),
-                    **_surroundings(t, primitive, primitive.bsdf),
+                    **_surroundings(builder, primitive, primitive.bsdf),
                     **emission,
                 }
             )
     return shapes
 
 
-def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
+def _instances(builder: SceneBuilder, primitive: ts.Instances) -> list[Node]:
     if primitive.file_a is not None or primitive.file_b is not None:
-        raise t.unsupported("a file of instances")
+        raise builder.unsupported("a file of instances")
     groups = []
     for master in primitive.masters:
         if isinstance(master, ts.Instances):
-            raise t.unsupported("instances within instances")
+            raise builder.unsupported("instances within instances")
         if not isinstance(master, ts.Quad | ts.Disk):
             _LOG.warning(
                 "%s: %s: Tungsten lights instances of a %s from the wrong places; here they are right",
-                t.source.path,
-                t.place,
+                builder.source.path,
+                builder.place,
                 master.kind,
             )
         # Masters do not shine, and the media are those of the instances.
@@ -252,12 +254,12 @@ def _instances(t: Translation, primitive: ts.Instances) -> list[Node]:
             int_medium=primitive.int_medium,
             ext_medium=primitive.ext_medium,
         )
-        shapes = {f"shape_{number}": shape for number, shape in enumerate(_shapes(t, bare))}
-        groups.append(t.add("shapegroup", {"type": "shapegroup", **shapes}))
-    _, rotation, _ = _parts(t, primitive.world_from_local)
+        shapes = {f"shape_{number}": shape for number, shape in enumerate(_shapes(builder, bare))}
+        groups.append(builder.add("shapegroup", {"type": "shapegroup", **shapes}))
+    _, rotation, _ = _parts(builder, primitive.world_from_local)
     nodes = []
     for placement in primitive.instances:
-        origin, turn, _ = _parts(t, placement.world_from_local)
+        origin, turn, _ = _parts(builder, placement.world_from_local)
         place = (primitive.world_from_local @ np.append(origin, 1.0))[:3]
         to_world = transform(_affine(rotation @ turn, place))
         nodes.append({"type": "instance", "shapegroup": groups[placement.id], "to_world": to_world})
@@ -303,7 +305,7 @@ def _triangles(
     return mesh
 
 
-def _parts(t: Translation, matrix: Matrix) -> tuple[_Array, _Array, _Array]:
+def _parts(builder: SceneBuilder, matrix: Matrix) -> tuple[_Array, _Array, _Array]:
     """Return position, unit axes (as columns) and their lengths, as Tungsten takes a matrix apart."""
     scale = np.linalg.norm(matrix[:3, :3], axis=0)
     known = scale > 0
@@ -312,7 +314,7 @@ def _parts(t: Translation, matrix: Matrix) -> tuple[_Array, _Array, _Array]:
     # An axis without length may point anywhere that the others do not.
     axes[:, ~known] = np.linalg.svd(axes[:, known])[0][:, known.sum() :]
     if abs(axes.T @ axes - np.diag(np.diagonal(axes.T @ axes))).max() > 1e-3:
-        raise t.unsupported("a sheared transform")
+        raise builder.unsupported("a sheared transform")
     return matrix[:3, 3], axes, scale
 
 

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from tungsten_dip.hosts.mitsuba.translation import Translation
+from tungsten_dip.hosts.mitsuba.scene_builder import SceneBuilder
 from tungsten_dip.scene.types import Skydome
 
 _Array = npt.NDArray[np.float64]
@@ -34,16 +34,16 @@ _RGB_FROM_XYZ = np.array(
 )
 
 
-def sky_pixels(t: Translation, skydome: Skydome) -> _Array:
+def sky_pixels(builder: SceneBuilder, skydome: Skydome) -> _Array:
     """Return the sky's radiance over latitude and longitude, shape (256, 512, 3), row 0 at the zenith.
 
     Raises InputError where the model is not defined: a sun below the horizon, turbidity beyond 1 to 10.
     """
     sun = skydome.world_from_local[:3, 1]
     if not 1.0 <= skydome.turbidity <= 10.0:
-        raise t.unsupported(f"a skydome of turbidity {skydome.turbidity} (expected 1 to 10)")
+        raise builder.unsupported(f"a skydome of turbidity {skydome.turbidity} (expected 1 to 10)")
     if sun[1] < 0.0:
-        raise t.unsupported("a skydome whose sun is below the horizon")
+        raise builder.unsupported("a skydome whose sun is below the horizon")
     elevation = math.asin(min(float(sun[1]), 1.0))
 
     theta = (np.arange(_HEIGHT // 2) + 0.5)[:, None] * math.pi / _HEIGHT

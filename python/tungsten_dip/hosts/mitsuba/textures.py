@@ -17,7 +17,7 @@ import OpenImageIO
 
 from tungsten_dip.buffers.image_file import MAX_PIXELS, RADIANCE_SUFFIXES, checked_name
 from tungsten_dip.errors import InputError
-from tungsten_dip.hosts.mitsuba.translation import Node, Translation, constant, transform_uv
+from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, constant, transform_uv
 from tungsten_dip.scene.types import (
     BitmapTexture,
     BladeTexture,
@@ -47,7 +47,7 @@ _SHAPE_RESOLUTION = 1024  # of the bitmaps that stand for disk and blade texture
 
 
 def texture_node(
-    t: Translation,
+    builder: SceneBuilder,
     texture: Texture,
     request: Request = "rgb",
     uv: Matrix = UV,
@@ -79,15 +79,15 @@ def texture_node(
         }
     if isinstance(texture, BitmapTexture):
         factor = scale * texture.scale if texture.interpolate else 1.0
-        return _bitmap_object(t, texture, request, uv, factor, least)
+        return _bitmap_object(builder, texture, request, uv, factor, least)
     if isinstance(texture, DiskTexture | BladeTexture):
         mask = coverage(texture, _SHAPE_RESOLUTION)
         value = np.atleast_1d(np.asarray(_requested(texture.value, request, scale, least)))
         return _bitmap_node(np.maximum(mask[:, :, None] * value, least), uv, clamp=True, nearest=False)
-    raise t.unsupported(f"a texture of type {texture.kind}")
+    raise builder.unsupported(f"a texture of type {texture.kind}")
 
 
-def slopes_node(t: Translation, texture: Texture, uv: Matrix = UV) -> Node:
+def slopes_node(builder: SceneBuilder, texture: Texture, uv: Matrix = UV) -> Node:
     """Return the texture of three channels that "tungsten_bump" expects of a height map.
 
     Between texels Tungsten interpolates their slopes; it repeats every height map and scales each.
@@ -95,8 +95,8 @@ def slopes_node(t: Translation, texture: Texture, uv: Matrix = UV) -> Node:
     Raises InputError for anything but a bitmap, and for an image that cannot be read.
     """
     if not isinstance(texture, BitmapTexture):
-        raise t.unsupported(f"bump mapping by a texture of type {texture.kind}")
-    heights = bitmap_pixels(t, texture, "average")[:, :, 0] * texture.scale
+        raise builder.unsupported(f"bump mapping by a texture of type {texture.kind}")
+    heights = bitmap_pixels(builder, texture, "average")[:, :, 0] * texture.scale
     across, down = (np.roll(heights, -1, axis) - np.roll(heights, 1, axis) for axis in (1, 0))
     slopes = np.stack((across, down, np.zeros_like(heights)), axis=2)
     return _bitmap_node(slopes, uv, clamp=False, nearest=False)
@@ -107,32 +107,32 @@ def is_constant(texture: Texture) -> bool:
     return isinstance(texture, ConstantTexture)
 
 
-def largest_value(t: Translation, texture: Texture) -> float:
+def largest_value(builder: SceneBuilder, texture: Texture) -> float:
     """Return the largest component anywhere in a texture."""
     if isinstance(texture, ConstantTexture | DiskTexture | BladeTexture):
         return max(texture.value)
     if isinstance(texture, CheckerTexture):
         return max(*texture.on_color, *texture.off_color)
     if isinstance(texture, BitmapTexture):
-        return float(bitmap_pixels(t, texture, "rgb").max()) * texture.scale
-    raise t.unsupported(f"a texture of type {texture.kind}")
+        return float(bitmap_pixels(builder, texture, "rgb").max()) * texture.scale
+    raise builder.unsupported(f"a texture of type {texture.kind}")
 
 
-def shines(t: Translation, primitive: Primitive) -> bool:
+def shines(builder: SceneBuilder, primitive: Primitive) -> bool:
     """Whether a primitive is a light that brings any."""
     if isinstance(primitive, Skydome):
         return primitive.intensity > 0.0
-    return primitive.emitter is not None and largest_value(t, primitive.emitter) > 0.0
+    return primitive.emitter is not None and largest_value(builder, primitive.emitter) > 0.0
 
 
-def bitmap_pixels(t: Translation, texture: BitmapTexture, request: Request) -> _Texels:
+def bitmap_pixels(builder: SceneBuilder, texture: BitmapTexture, request: Request) -> _Texels:
     """Return the texels as Tungsten holds them, without scale.
 
     Shape (height, width, 3 or 1), row 0 at the top.
     """
     key = ("pixels", str(texture.file), request, texture.gamma_correct)
-    texels: _Texels | None = t.made(key)
-    return t.remember(key, _read_texels(texture, request)) if texels is None else texels
+    texels: _Texels | None = builder.made(key)
+    return builder.remember(key, _read_texels(texture, request)) if texels is None else texels
 
 
 def coverage(texture: DiskTexture | BladeTexture, resolution: int) -> npt.NDArray[np.float64]:
@@ -156,17 +156,17 @@ def _requested(value: Vec3, request: Request, scale: float, least: float) -> Vec
 
 
 def _bitmap_object(
-    t: Translation, texture: BitmapTexture, request: Request, uv: Matrix, scale: float, least: float
+    builder: SceneBuilder, texture: BitmapTexture, request: Request, uv: Matrix, scale: float, least: float
 ) -> Any:
     settings = (request, texture.gamma_correct, texture.clamp, texture.interpolate, scale, least)
     key = ("texture", str(texture.file), *settings, uv.tobytes().hex())
-    found = t.made(key)
+    found = builder.made(key)
     if found is None:
-        pixels = bitmap_pixels(t, texture, request)
+        pixels = bitmap_pixels(builder, texture, request)
         if scale != 1.0 or least > -math.inf:
             pixels = np.maximum(pixels * np.float32(scale), np.float32(least))
         node = _bitmap_node(pixels, uv, clamp=texture.clamp, nearest=not texture.interpolate)
-        found = t.remember(key, mi.load_dict(node))
+        found = builder.remember(key, mi.load_dict(node))
     return found
 
 

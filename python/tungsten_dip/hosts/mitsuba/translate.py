@@ -15,10 +15,10 @@ from tungsten_dip.hosts.mitsuba.emitters import (
     point_node,
     together,
 )
+from tungsten_dip.hosts.mitsuba.scene_builder import SceneBuilder, load
 from tungsten_dip.hosts.mitsuba.sensor import lens_of_integrator, sensor_node
 from tungsten_dip.hosts.mitsuba.shapes import add_shapes
-from tungsten_dip.hosts.mitsuba.translated import TranslatedScene
-from tungsten_dip.hosts.mitsuba.translation import Translation, load
+from tungsten_dip.hosts.mitsuba.translated_scene import TranslatedScene
 from tungsten_dip.scene import types as ts
 
 _LOG = logging.getLogger(__name__)
@@ -32,50 +32,50 @@ def translate(scene: ts.Scene) -> TranslatedScene:
     Raises InputError, one line that names the construct, for what Mitsuba cannot show as Tungsten does, and
     for meshes and images that cannot be read.
     """
-    t = Translation(scene)
+    builder = SceneBuilder(scene)
     try:
-        return _translated(t, scene)
+        return _translated(builder, scene)
     except RuntimeError as error:
-        raise t.refused(error) from None
+        raise builder.refused(error) from None
 
 
-def _translated(t: Translation, scene: ts.Scene) -> TranslatedScene:
-    integrator = _path_tracer(t, scene.integrator)
+def _translated(builder: SceneBuilder, scene: ts.Scene) -> TranslatedScene:
+    integrator = _path_tracer(builder, scene.integrator)
     lights = 0
     surroundings: list[tuple[Any, Surrounding]] = []
     for number, primitive in enumerate(scene.primitives):
-        t.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
+        builder.place = f"primitives[{number}]" + (f' "{primitive.name}"' if primitive.name else "")
         match primitive:
             case ts.Point():
-                node = point_node(t, primitive)
+                node = point_node(builder, primitive)
             case ts.InfiniteSphere() | ts.InfiniteSphereCap() | ts.Skydome():
-                node = environment_node(t, primitive)
+                node = environment_node(builder, primitive)
                 if node is not None:
                     surroundings.append((load(node), primitive))
                 continue
             case _:
-                lights += add_shapes(t, primitive)
+                lights += add_shapes(builder, primitive)
                 continue
         if node is not None:
-            t.add("emitter", node)
+            builder.add("emitter", node)
             lights += 1
-    _log_replacement(t, scene.integrator, lights + len(surroundings))
+    _log_replacement(builder, scene.integrator, lights + len(surroundings))
     if surroundings:
-        t.add("emitter", together(surroundings))
+        builder.add("emitter", together(surroundings))
     elif not lights:
-        t.add("emitter", default_environment())
-    t.add("sensor", sensor_node(t, scene.camera))
+        builder.add("emitter", default_environment())
+    builder.add("sensor", sensor_node(builder, scene.camera))
     return TranslatedScene(
-        t.scene,
-        t.albedo,
+        builder.scene,
+        builder.albedo,
         integrator,
         scene.camera.reconstruction_filter,
         scene.camera.pixel_center,
-        lens_of_integrator(t, scene.camera),
+        lens_of_integrator(builder, scene.camera),
     )
 
 
-def _log_replacement(t: Translation, integrator: ts.Integrator, lights: int) -> None:
+def _log_replacement(builder: SceneBuilder, integrator: ts.Integrator, lights: int) -> None:
     """Log that another integrator is replaced, if it is: as a warning where the picture differs.
 
     Tungsten's paths from several lights have weights that sum to less than 1: those that hit a light ignore
@@ -90,19 +90,19 @@ def _log_replacement(t: Translation, integrator: ts.Integrator, lights: int) -> 
     if bidirectional and lights > 1:
         _LOG.warning(
             "%s: a path_tracer renders in place of %s, which in Tungsten is too dark with several lights",
-            t.source.path,
+            builder.source.path,
             integrator.kind,
         )
     else:
-        _LOG.info("%s: a path_tracer renders in place of %s", t.source.path, integrator.kind)
+        _LOG.info("%s: a path_tracer renders in place of %s", builder.source.path, integrator.kind)
 
 
-def _path_tracer(t: Translation, integrator: ts.Integrator) -> ts.PathTracer:
+def _path_tracer(builder: SceneBuilder, integrator: ts.Integrator) -> ts.PathTracer:
     """Return the path tracer that converges to the picture of an integrator."""
     if isinstance(integrator, ts.PathTracer) and integrator.kind == ts.PathTracer.kind:
         return integrator
     if isinstance(integrator, ts.LightTracer):
-        raise t.unsupported("a light_tracer, which shows no mirrors,")
+        raise builder.unsupported("a light_tracer, which shows no mirrors,")
     kept = {}
     if isinstance(integrator, ts.PathTracer | ts.PhotonMap):
         kept = {name: getattr(integrator, name) for name in ("low_order_scattering", "include_surfaces")}

@@ -17,7 +17,7 @@ Node = dict[str, Any]
 
 
 @dataclass
-class Translation:
+class SceneBuilder:
     """Collects the nodes of the scene, each under its own id, and the albedo texture of every BSDF.
 
     Objects that Tungsten shares (a BSDF on two primitives, a medium in two) are made once, see `made`.
