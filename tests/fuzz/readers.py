@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from conftest import synthetic_render
+from synthetic import synthetic_render
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.fit import FitSettings, denoise

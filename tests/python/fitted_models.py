@@ -1,4 +1,4 @@
-"""Small fitted networks, for every test that saves, loads, uses or goes on training one."""
+"""Small fits and parts of them, for every test that fits, saves, loads, uses or goes on training."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import Cues, Evidence, evidence_from_buffers
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.pilots.surfaces import Surfaces, surfaces_of_colors
 from tungsten_dip.fit.preparation.splitting import HalvedImage
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.onnx.graph import graph_of
 from tungsten_dip.progress import silent
 
 DRAFT = FitSettings("draft", iterations=20, threads=1, device="cpu")
+
+
+def short(**changes: Any) -> FitSettings:
+    """Return the settings of a fit of 30 steps on one thread, by default of preset draft."""
+    return FitSettings(**{"preset": "draft", "iterations": 30, "threads": 1, "device": "cpu", **changes})
 
 
 def paper_model(network: str, buffers: RenderBuffers, **changes: Any) -> Model:
@@ -37,6 +43,12 @@ def session_of(model: Model) -> Any:
 def evidence_of(buffers: RenderBuffers, pilots: Sequence[Pilot]) -> tuple[Evidence, Cues]:
     """Return what a fit with these pilots knows of the buffers."""
     return evidence_from_buffers(HalvedImage(buffers), pilots, Clock(), silent, threads=1)
+
+
+def surfaces_of(buffers: RenderBuffers) -> tuple[Surfaces, ...]:
+    """Return the surfaces of both halves, in the units of the buffers."""
+    assert buffers.color.halves is not None
+    return surfaces_of_colors(buffers, buffers.color.halves, 1.0, 1)
 
 
 def check_result(result: FitResult, buffers: RenderBuffers) -> None:

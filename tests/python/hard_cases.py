@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import strategies
 
-from conftest import relmse, synthetic_render
+from synthetic import relmse, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.fit import FitResult

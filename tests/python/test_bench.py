@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from browser import assert_page_works
+from synthetic import synthetic_render
 from tungsten_dip.bench import methods, pareto, plot
 from tungsten_dip.bench.methods import Plan, settings_text
 from tungsten_dip.bench.nfor import nfor_image
@@ -38,9 +39,9 @@ DENOISER = "TUNGSTEN_DENOISER"
 
 
 @pytest.fixture
-def folder(tmp_path, make_render):
+def folder(tmp_path):
     """A set as a folder of Tungsten's buffers, its reference in the folder above."""
-    render = make_render(32, 48)
+    render = synthetic_render(32, 48)
     write_tungsten_folder(tmp_path / "room" / "n16", render.buffers)
     write_image(tmp_path / "room" / "reference.exr", render.reference)
     return tmp_path / "room" / "n16"
@@ -137,8 +138,8 @@ def test_a_missing_reference_is_one_line(folder, capfd, what):
     refused(capfd, ["bench", what, str(folder)], "no reference to measure against", "=REFERENCE.exr")
 
 
-def test_a_crop_keeps_the_middle_in_multiples_of_32(tmp_path, make_render):
-    render = make_render(67, 101)
+def test_a_crop_keeps_the_middle_in_multiples_of_32(tmp_path):
+    render = synthetic_render(67, 101)
     write_tungsten_folder(tmp_path / "odd", render.buffers)
     write_image(tmp_path / "odd" / "reference.exr", render.reference)
     write_image(tmp_path / "odd" / "nfor.exr", render.reference)
@@ -156,8 +157,8 @@ def test_a_crop_keeps_the_middle_in_multiples_of_32(tmp_path, make_render):
     assert cropped_as_published(crop).digest == crop.digest
 
 
-def test_alpha_and_spp_are_cropped_and_make_another_set(tmp_path, make_render):
-    render = make_render(67, 101)
+def test_alpha_and_spp_are_cropped_and_make_another_set(tmp_path):
+    render = synthetic_render(67, 101)
     alpha = np.linspace(0, 1, 67 * 101, dtype=np.float32).reshape(67, 101, 1)
     result = FitResult(render.buffers.color.mean, FitSettings(), 0.0, 1)
     write_image(tmp_path / "reference.exr", render.reference)
@@ -372,9 +373,7 @@ def test_the_front_is_what_no_faster_method_beats(bench_set):
     assert lines[5].startswith("| d |  | inf |")
 
 
-def test_more_samples_cost_what_they_take_beyond_the_noisy_render(
-    bench_set, fits, tmp_path, monkeypatch, make_render
-):
+def test_more_samples_cost_what_they_take_beyond_the_noisy_render(bench_set, fits, tmp_path, monkeypatch):
     scene = tmp_path / "scene.json"
     scene.write_text(
         json.dumps({"camera": {"type": "pinhole", "resolution": [48, 32]}, "renderer": {"spp": 16}})
@@ -383,7 +382,7 @@ def test_more_samples_cost_what_they_take_beyond_the_noisy_render(
 
     def render(scene, spp, seed, threads, progress):
         asked.append((spp, seed))
-        return make_render(32, 48, spp=spp, seed=seed).buffers
+        return synthetic_render(32, 48, spp=spp, seed=seed).buffers
 
     clock = iter(range(0, 800, 8))
     monkeypatch.setattr("tungsten_dip.bench.methods.render", render)
@@ -495,10 +494,10 @@ def test_nfor_of_tungsten_denoises(render):
     assert np.mean((image - render.reference) ** 2) < 0.5 * np.mean((noisy - render.reference) ** 2)
 
 
-def test_sets_whose_names_look_alike_keep_their_own_images(tmp_path, make_render, fits):
+def test_sets_whose_names_look_alike_keep_their_own_images(tmp_path, fits):
     folders = []
     for name, seed in (("a_b", 1), ("a-b", 2)):
-        render = make_render(seed=seed)
+        render = synthetic_render(seed=seed)
         write_tungsten_folder(tmp_path / name, render.buffers)
         write_image(tmp_path / name / "reference.exr", render.reference)
         folders.append(str(tmp_path / name))

@@ -6,6 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from synthetic import synthetic_render  # noqa: E402
 from tungsten_dip.bench import methods, paper_table  # noqa: E402
 from tungsten_dip.bench.iteration import _convolutions, time_iterations, times_text  # noqa: E402
 from tungsten_dip.bench.paper_curve import checkpoints_up_to, paper_curve  # noqa: E402
@@ -20,8 +21,8 @@ from tungsten_dip.progress import silent  # noqa: E402
 
 
 @pytest.fixture
-def bench_set(make_render):
-    render = make_render(32, 48)
+def bench_set():
+    render = synthetic_render(32, 48)
     return BenchSet("room/n16", render.buffers, render.reference, None, "digest")
 
 

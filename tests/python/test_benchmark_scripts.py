@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from synthetic import synthetic_render
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.write import write_tungsten_folder
 
@@ -27,8 +28,8 @@ def rows(monkeypatch, capsys):
 
 
 @pytest.fixture
-def room(make_render, tmp_path):
-    render = make_render(16, 24)
+def room(tmp_path):
+    render = synthetic_render(16, 24)
     write_tungsten_folder(tmp_path / "room", render.buffers)
     write_image(tmp_path / "room" / "reference.exr", render.reference)
     return tmp_path / "room"

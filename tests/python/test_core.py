@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from conftest import MakeRender, SyntheticRender
+from synthetic import SyntheticRender, synthetic_render
 from tungsten_dip import _core
 from tungsten_dip.buffers.half_buffers import compare_halves
 from tungsten_dip.buffers.prefilter import noise_in, prefilter_features
@@ -205,7 +205,7 @@ def test_without_halves_the_neighbours_tell() -> None:
 
 
 @pytest.mark.parametrize("shape", SIZES)
-def test_every_size_passes_through_everything(shape: tuple[int, int], make_render: MakeRender) -> None:
+def test_every_size_passes_through_everything(shape: tuple[int, int]) -> None:
     color = _noisy_color(*shape).color
     normal = Buffer(color.mean - 5, color.half_a, color.half_b, color.variance)
     nowhere = Buffer(np.full((*shape, 1), np.nan, np.float32))
@@ -244,8 +244,8 @@ def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
     assert np.isnan(alone.correlation)
 
 
-def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRender) -> None:
-    noisy, truth = make_render(seed=1).buffers, make_render(spp=4, seed=2).buffers
+def test_prefiltering_removes_noise_and_changes_nothing_else() -> None:
+    noisy, truth = synthetic_render(seed=1).buffers, synthetic_render(spp=4, seed=2).buffers
     assert noisy.normal is not None
     assert truth.normal is not None
     clean = Buffer(truth.normal.mean, truth.normal.mean, truth.normal.mean, np.zeros_like(truth.normal.mean))
@@ -257,7 +257,7 @@ def test_prefiltering_removes_noise_and_changes_nothing_else(make_render: MakeRe
     assert filtered.normal is not None
     np.testing.assert_array_equal(filtered.normal.mean, clean.mean)
 
-    reference = np.mean([make_render(seed=seed).buffers.albedo.mean for seed in range(10, 40)], axis=0)
+    reference = np.mean([synthetic_render(seed=seed).buffers.albedo.mean for seed in range(10, 40)], axis=0)
     assert buffers.albedo is not None
     assert filtered.albedo is not None
     noise = np.mean((buffers.albedo.mean - reference) ** 2)
@@ -310,8 +310,8 @@ def test_of_a_feature_without_halves_no_remaining_noise_is_claimed() -> None:
     assert filtered.mean.std() < 0.7 * noisy.std()
 
 
-def test_threads_do_not_change_a_bit(make_render: MakeRender) -> None:
-    buffers = make_render(height=71, width=133).buffers
+def test_threads_do_not_change_a_bit() -> None:
+    buffers = synthetic_render(height=71, width=133).buffers
     one, many = prefilter_features(buffers, threads=1), prefilter_features(buffers, threads=5)
     assert _frozen_bytes(one) == _frozen_bytes(many)
     assert compare_halves(buffers, 1).correlation == compare_halves(buffers, 5).correlation

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import SyntheticRender
+from synthetic import SyntheticRender
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.fit import FitResult
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from conftest import SyntheticRender
+from synthetic import SyntheticRender
 from tungsten_dip.buffers.render_buffers import Buffer, FloatArray, Halves
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.candidates import Candidates

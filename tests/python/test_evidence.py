@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import MakeRender
 from fitted_models import evidence_of
+from synthetic import synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise, evidence
 from tungsten_dip.fit.candidates import Candidates
@@ -20,9 +20,7 @@ from tungsten_dip.fit.presets import DRAFT_PILOTS
 from tungsten_dip.fit.scoring.measure import ErrorMeasure, _caps, _denominators
 
 
-def test_guides_are_as_noisy_as_is_said_of_them(
-    make_render: MakeRender, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_guides_are_as_noisy_as_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of all samples have half the noise of those of one half: how renders differ tells."""
     makers: list[PilotMaker] = []
 
@@ -33,7 +31,7 @@ def test_guides_are_as_noisy_as_is_said_of_them(
     for module in (evidence, all_samples):
         monkeypatch.setattr(module, "PilotMaker", recorded)
     for seed in range(4):
-        denoise(make_render(20, 28, seed=seed).buffers, FitSettings("balanced", iterations=1, threads=1))
+        denoise(synthetic_render(20, 28, seed=seed).buffers, FitSettings("balanced", iterations=1, threads=1))
     for images in (2, 1):
         guides = [maker.guides for maker in makers if len(maker.colors) == images]
         assert len(guides) == 4

@@ -10,7 +10,6 @@ import random
 import string
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
@@ -23,6 +22,7 @@ import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
+from synthetic import synthetic_render
 from tungsten_dip.buffers import atomic, image_file
 from tungsten_dip.buffers.atomic import check_writable, replacing, write_text
 from tungsten_dip.buffers.image_file import MOST_HDR, write_exr, write_image
@@ -494,11 +494,9 @@ def test_layers_and_parts_of_the_files_of_a_folder_travel_by_their_names(
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 8), (13, 7)])
 @pytest.mark.parametrize("spp", [None, 16.0, "varies"])
-def test_buffers_of_a_host_become_layers(
-    tmp_path: Path, make_render: Callable, size: tuple[int, int], spp: object
-) -> None:
+def test_buffers_of_a_host_become_layers(tmp_path: Path, size: tuple[int, int], spp: object) -> None:
     per_pixel = noise((*size, 1)) if spp == "varies" else spp
-    buffers = make_render(height=size[0], width=size[1]).buffers
+    buffers = synthetic_render(height=size[0], width=size[1]).buffers
     buffers = RenderBuffers(
         **dict(buffers.quantities()), spp=per_pixel, alpha=noise((*size, 1), 3), attributes={"host": "a test"}
     )
@@ -512,8 +510,8 @@ def test_buffers_of_a_host_become_layers(
     assert_same(buffers, read_buffers(tmp_path / "folder"))
 
 
-def test_a_folder_of_another_render_is_not_mixed_in(tmp_path: Path, make_render: Callable) -> None:
-    buffers = make_render(height=3, width=4).buffers
+def test_a_folder_of_another_render_is_not_mixed_in(tmp_path: Path) -> None:
+    buffers = synthetic_render(height=3, width=4).buffers
     write_tungsten_folder(tmp_path, buffers)
     write_tungsten_folder(tmp_path, buffers)
     with pytest.raises(InputError, match=r"holds .* of another render; remove it"):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conftest import MakeRender, SyntheticRender
 from fitted_models import DRAFT, check_result
+from synthetic import SyntheticRender, synthetic_render
 from tungsten_dip.buffers.half_buffers import without_foreign_halves
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import denoise
@@ -102,10 +102,10 @@ def test_halves_of_unequal_size_are_used(render: SyntheticRender) -> None:
     ],
 )
 def test_noise_that_one_image_alone_shows_is_not_taken_for_detail(
-    lost: float, left: str, skipped: bool, make_render: MakeRender
+    lost: float, left: str, skipped: bool
 ) -> None:
     """``skipped``: the renderer left out of the mean what it could not compute."""
-    render = make_render(96, 96)
+    render = synthetic_render(96, 96)
     block = np.s_[20:80, 20:80]
     planes = {name: plane.copy() for name, plane in render.buffers.color.planes()}
     for name, plane in planes.items():

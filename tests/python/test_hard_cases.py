@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from conftest import synthetic_render
 from hard_cases import CASES, HardCase, broken_renders, exposed, healthy, measure
+from synthetic import synthetic_render
 from tungsten_dip.buffers.half_buffers import compare_halves
 from tungsten_dip.buffers.prefilter import prefilter_features
 from tungsten_dip.buffers.render_buffers import RenderBuffers

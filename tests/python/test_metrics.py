@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from synthetic import synthetic_render
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.relmse import relative_squared_error
 from tungsten_dip.errors import InputError
@@ -29,8 +30,8 @@ def test_an_image_equals_itself(gradient):
     assert result.mean_ratio == 1
 
 
-def test_every_measure_worsens_with_noise(render, make_render):
-    little = compare(make_render(spp=256).buffers.color.mean, render.reference)
+def test_every_measure_worsens_with_noise(render):
+    little = compare(synthetic_render(spp=256).buffers.color.mean, render.reference)
     much = compare(render.buffers.color.mean, render.reference)
     assert little.psnr > much.psnr
     assert little.ssim > much.ssim

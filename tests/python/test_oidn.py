@@ -3,7 +3,7 @@ import logging
 import numpy as np
 import pytest
 
-from conftest import relmse
+from synthetic import relmse, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise
@@ -84,9 +84,9 @@ def test_without_the_package_the_command_that_installs_it_is_told(render, withou
         image(render)
 
 
-def test_as_a_pilot_it_is_judged_by_the_halves(make_render):
+def test_as_a_pilot_it_is_judged_by_the_halves():
     """Each half's image comes from that half alone; the result is no worse than without it."""
-    render = make_render(spp=4)
+    render = synthetic_render(spp=4)
 
     def error(pilot):
         settings = FitSettings(preset="draft", threads=1, pilot=pilot)

@@ -11,8 +11,8 @@ import onnxruntime as ort
 import pytest
 from hypothesis import given, settings, strategies
 
-from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, paper_model, session_of
+from synthetic import SyntheticRender, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, denoise, inference

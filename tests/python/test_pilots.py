@@ -1,4 +1,4 @@
-"""What pilots make of small scenes whose light is known: lamps, stray light, surfaces that look alike."""
+"""What filters make of small scenes: dark surfaces, noisy features, shadows that only a guide shows."""
 
 from __future__ import annotations
 
@@ -8,100 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fitted_models import short, surfaces_of
+from synthetic import SyntheticRender, buffer_of_halves, relmse, rgb_from_plane, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.fit import denoise
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
-from tungsten_dip.fit.pilots.surfaces import Surfaces, divisor, surfaces_of_colors
+from tungsten_dip.fit.presets import BALANCED_PILOTS
 
 Plane = np.ndarray
 
 
-def _rgb(plane: Plane) -> FloatImage:
-    return np.repeat(plane[:, :, None], 3, axis=2).astype(np.float32)
-
-
-def _buffer(half_a: FloatImage, half_b: FloatImage) -> Buffer:
-    return Buffer((half_a + half_b) / 2, half_a, half_b)
-
-
-def _surfaces(
-    emitted: tuple[Plane, Plane], seen: tuple[Plane, Plane] | None = None, wall: float = 0.5
-) -> tuple[Surfaces, ...]:
-    """Return the surfaces of a wall of radiance 0.3, and this albedo, before which light is emitted.
-
-    ``emitted`` is what the albedo holds of it, ``seen`` what the colour does (None: the same).
-    """
-    albedo = [_rgb(np.where(light > 0, 1 + light, wall)) for light in emitted]
-    color_a, color_b = (_rgb(0.3 + light) for light in seen or emitted)
-    buffers = RenderBuffers(_buffer(color_a, color_b), albedo=_buffer(*albedo))
-    return surfaces_of_colors(buffers, (color_a, color_b), 1.0, 1)
-
-
-@pytest.mark.parametrize("pixel", [(8, 9), (0, 9), (0, 0)])
-def test_light_that_neither_the_other_half_nor_pixels_around_see_is_stray(pixel: tuple[int, int]) -> None:
-    a, b = np.zeros((2, 20, 24))
-    row, column = pixel
-    a[pixel] = 30
-    assert all(surfaces.emission.max() <= 1e-4 for surfaces in _surfaces((a, b)))
-    b[pixel] = 0.05
-    assert _surfaces((a, b))[0].emission.max() == pytest.approx(0.2, rel=1e-3)
-    b[pixel] = 10
-    assert _surfaces((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
-    b[pixel] = 0
-    a[row + 1, column] = 30
-    assert _surfaces((a, b))[0].emission.max() < 30
-    b[row + 1, column + 1] = 30
-    assert _surfaces((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
-
-
-def test_the_sun_is_not_smeared_over_the_sky() -> None:
-    """The sky emits too, a little."""
-    sky = np.full((40, 48), 2.0)
-    sky[20:22, 30:32] = 5e4
-    for surfaces in _surfaces((sky, sky)):
-        beside = surfaces.smooth_emission[sky == 2]
-        assert beside.max() <= 4 * 2 + 1e-5
-        assert surfaces.smooth_emission[sky > 2].min() > 0.5 * 5e4
-
-
-def test_light_that_the_colour_does_not_hold_is_an_outlier() -> None:
-    light = np.zeros((20, 24))
-    light[8:12, 9:14] = 1000.0
-    for surfaces in _surfaces((light, light), (0 * light, 0 * light)):
-        assert surfaces.emission.max() <= 0.3 + 1e-5
-    for surfaces in _surfaces((light, light)):
-        assert surfaces.emission.max() == pytest.approx(1000, rel=1e-5)
-
-
-def _covered(angle: float, size: int = 48, subpixels: int = 16) -> Plane:
-    """Which part of every pixel a lamp of 18x10 pixels covers, turned by an angle."""
-    y, x = (np.indices((size * subpixels, size * subpixels)) + 0.5) / subpixels - size / 2
-    across, along = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-    inside = (np.abs(across) < 9) & (np.abs(along) < 5)
-    return inside.reshape(size, subpixels, size, subpixels).mean(axis=(1, 3))
-
-
-@pytest.mark.parametrize("wall", [0.5, 1.0])
-def test_the_rim_of_a_lamp_loses_most_of_its_noise(wall: float) -> None:
-    """Four samples of each half say which part of a pixel the lamp covers, also before a white wall."""
-    errors, noise = [], []
-    for seed in range(3):
-        rng, cover = np.random.default_rng(seed), _covered(angle=0.3)
-        a, b = (30 * rng.binomial(4, cover) / 4 for _ in range(2))
-        for surfaces in _surfaces((a, b), wall=wall):
-            errors.append(np.mean((surfaces.smooth_emission - _rgb(30 * cover)) ** 2))
-            noise.append(np.mean((surfaces.emission - _rgb(30 * cover)) ** 2))
-    assert np.mean(errors) < 0.5 * np.mean(noise)
-
-
-def test_what_a_mirror_shows_is_not_divided_by_its_black_albedo() -> None:
-    albedo = np.array([[[0.5] * 3, [0.0] * 3, [0.0005] * 3]], np.float32)
-    np.testing.assert_allclose(divisor(albedo)[0, :, 0], [0.51, 1, 1])
-
-
 def _noisy(truth: Plane, shape: float) -> tuple[FloatImage, FloatImage]:
     rng = np.random.default_rng(0)
-    a, b = (_rgb(truth * rng.gamma(shape, 1 / shape, truth.shape)) for _ in range(2))
+    a, b = (rgb_from_plane(truth * rng.gamma(shape, 1 / shape, truth.shape)) for _ in range(2))
     return a, b
 
 
@@ -111,7 +31,7 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     surface = (columns >= 16) & (columns < 32)
     halves = _noisy(np.where(surface, 0.03, 0), shape=0.2)
     depth = Buffer(np.where(surface, 2, 0)[:, :, None].astype(np.float32))
-    surfaces = surfaces_of_colors(RenderBuffers(_buffer(*halves), depth=depth), halves, 1.0, 1)
+    surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves), depth=depth))
     for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(
         Pilot("guided", 6, step=2, k=1.0)
     ):
@@ -122,12 +42,13 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
 def test_the_previous_frame_guides_pilots_of_the_color() -> None:
     """It shows stripes of shadow that the noise hides."""
     truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
-    halves, previous = _noisy(truth, shape=0.5), (_rgb(truth), _rgb(truth))
-    surfaces = surfaces_of_colors(RenderBuffers(_buffer(*halves)), halves, 1.0, 1)
+    halves, previous = _noisy(truth, shape=0.5), (rgb_from_plane(truth), rgb_from_plane(truth))
+    surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves)))
     alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1)
     guided = replace(alone, previous=previous)
     errors = [
-        np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - _rgb(truth)) ** 2) for maker in (alone, guided)
+        np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - rgb_from_plane(truth)) ** 2)
+        for maker in (alone, guided)
     ]
     assert errors[1] < 0.5 * errors[0]
 
@@ -149,3 +70,36 @@ def test_the_previous_frame_guides_pilots_of_the_color() -> None:
 def test_a_pilot_that_no_filter_computes_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Pilot(radius=6, **wrong)
+
+
+def test_windows_as_large_as_the_image_are_left_out() -> None:
+    render = synthetic_render(height=32, width=48)
+    result = denoise(render.buffers, short(preset="final", iterations=2))
+    assert result.model is not None
+    assert result.model.blend is not None
+    assert result.model.blend.layout.pilots == BALANCED_PILOTS
+
+
+def test_a_pilot_of_the_color_does_without_features(render: SyntheticRender) -> None:
+    """In mirrors and glass features are noise: what one pilot makes of the colour must not show it."""
+    rng = np.random.default_rng(0)
+
+    def noise(feature: Buffer | None) -> Buffer:
+        assert feature is not None
+        return Buffer(*(rng.uniform(0, 1, feature.mean.shape).astype(np.float32) for _ in range(3)))
+
+    def images(buffers: RenderBuffers, pilot: Pilot) -> tuple[FloatImage, ...]:
+        color = buffers.color
+        assert color.half_a is not None
+        assert color.half_b is not None
+        halves, surfaces = (color.half_a, color.half_b), surfaces_of(buffers)
+        return PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(pilot)
+
+    features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
+    noisy = render.buffers.with_quantities(**features)
+    of_color, of_features = Pilot("color", 4, k=1.0), Pilot("guided", 4, k=1.0)
+    alone = images(render.buffers.with_quantities(**dict.fromkeys(features)), of_color)
+    np.testing.assert_array_equal(images(noisy, of_color), images(render.buffers, of_color))
+    np.testing.assert_array_equal(images(noisy, of_color), alone)
+    errors = [relmse(images(noisy, pilot)[0], render.reference) for pilot in (of_color, of_features)]
+    assert errors[0] < 0.8 * errors[1]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from browser import assert_page_works
+from synthetic import synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.fit.result import FitResult, HistoryPoint
 from tungsten_dip.fit.settings import FitSettings
@@ -120,8 +121,8 @@ def test_what_is_not_known_is_not_shown(error, render):
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 7)])
-def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
-    small = make_render(height, width)
+def test_small_and_broken_pictures_have_a_page_too(height, width):
+    small = synthetic_render(height, width)
     color = small.reference.copy()
     color[0, 0] = (np.nan, np.inf, -1)
     error = np.full((height, width, 1), np.nan, np.float32)
@@ -132,8 +133,8 @@ def test_small_and_broken_pictures_have_a_page_too(make_render, height, width):
     assert not re.search(r"\bnan\b", page.text)
 
 
-def test_the_depth_of_the_sky_does_not_hide_the_rest(make_render):
-    render = make_render(8, 8)
+def test_the_depth_of_the_sky_does_not_hide_the_rest():
+    render = synthetic_render(8, 8)
     depth = np.full((8, 8, 1), 2, np.float32)
     depth[:4] = 1e10
     (picture,) = _features(RenderBuffers(Buffer(render.reference), depth=Buffer(depth)))

@@ -7,8 +7,8 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from conftest import relmse
 from moving_camera import HEIGHT, WIDTH, true_frame
+from synthetic import relmse, synthetic_render
 from tungsten_dip.buffers.image_file import write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
@@ -592,15 +592,15 @@ def test_a_cut_is_told_by_what_is_in_sight(tmp_path):
     assert follower.denoise(now.buffers, now.camera).how == "cut"
 
 
-def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path, make_render):
+def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path):
     follower = Follower(DRAFT, 0)
-    follower.denoise(make_render(spp=4096).buffers)
-    assert follower.denoise(make_render(spp=2, seed=1).buffers).how == "cut"
-    assert follower.denoise(make_render(20, 30).buffers).how == "cut"
+    follower.denoise(synthetic_render(spp=4096).buffers)
+    assert follower.denoise(synthetic_render(spp=2, seed=1).buffers).how == "cut"
+    assert follower.denoise(synthetic_render(20, 30).buffers).how == "cut"
 
 
 @pytest.mark.parametrize("by", ["sight", "size", "error"])
-def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, make_render, by):
+def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, by):
     follower = Follower(DRAFT, 0)
     for n in range(2):
         frame = true_frame(tmp_path, 0.05 * n, seed=n)
@@ -611,7 +611,7 @@ def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, make_render, by)
     if by == "error":
         follower._error = 1e-12  # any error is so far above it that it tells of a cut
     if by == "size":
-        cut = follower.denoise(make_render(20, 30).buffers)
+        cut = follower.denoise(synthetic_render(20, 30).buffers)
     else:
         cut = follower.denoise(frame.buffers, frame.camera)
     assert cut.how == "cut"
@@ -619,10 +619,10 @@ def test_after_a_cut_frames_follow_with_a_new_network(tmp_path, make_render, by)
     assert follower.models == Models(cut.result.model, following=None, first=first, features=features)
 
 
-def test_a_frame_without_noise_makes_no_cut_of_the_next_one(make_render):
+def test_a_frame_without_noise_makes_no_cut_of_the_next_one():
     follower = Follower(DRAFT)
-    card = make_render(spp=10**9).buffers
-    frames = [make_render(seed=0).buffers, card, make_render(seed=1).buffers]
+    card = synthetic_render(spp=10**9).buffers
+    frames = [synthetic_render(seed=0).buffers, card, synthetic_render(seed=1).buffers]
     followed = [follower.denoise(frame) for frame in frames]
     assert followed[1].result.model is None
     assert [f.how for f in followed] == ["fitted", "followed", "followed"]

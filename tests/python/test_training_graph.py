@@ -9,8 +9,8 @@ import numpy as np
 import onnx
 import pytest
 
-from conftest import SyntheticRender, synthetic_render
 from fitted_models import DRAFT, evidence_of
+from synthetic import SyntheticRender, synthetic_render
 from tungsten_dip.buffers.render_buffers import FloatArray, FloatImage
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.evidence import Cues, Evidence, with_best_baseline

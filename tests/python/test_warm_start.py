@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import SyntheticRender, relmse
 from fitted_models import DRAFT, paper_model
+from synthetic import SyntheticRender, relmse
 from tungsten_dip.buffers.render_buffers import Buffer
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
-from conftest import synthetic_render
 from kills import COMMANDS, Command, files, start, temporary_files, unreadable, write_inputs
 from row import Row
+from synthetic import synthetic_render
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten, tungsten_dip
 

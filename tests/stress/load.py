@@ -6,9 +6,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from conftest import synthetic_render
 from moving_camera import write_frames
 from row import Row
+from synthetic import synthetic_render
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.sequence.frames import find_frames
 from tungsten_dip.sequence.work import Run, denoise_frames

@@ -51,10 +51,8 @@ def bsdf_object(
     found = builder.made(key)
     if found is not None:
         return found
-    outer, builder.place = (
-        builder.place,
-        f"{builder.place}, {_named(bsdf)}" if builder.place else _named(bsdf),
-    )
+    outer = builder.place
+    builder.place = f"{outer}, {_named(bsdf)}" if outer else _named(bsdf)
     node = _hair(bsdf, faces_viewer) if isinstance(bsdf, ts.HairBsdf) else _node(builder, bsdf, uv)
     if heights is not None:
         if shape is None:
