@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FloatImage = npt.NDArray[np.float32]
 
 Halves = tuple[FloatImage, FloatImage]
-"""An image made only of half A of the samples, and one of the same shape made only of half B."""
+"""Made of half A of the samples, and the same made of half B: as a rule images, always of one shape."""
 
 FloatArray = npt.NDArray[np.float32]
 """Numbers of any shape that is not an image's."""
