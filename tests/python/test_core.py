@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,6 +134,20 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
     for _, buffer in mended.quantities():
         assert all(np.isfinite(array).all() for _, array in buffer.planes())
     assert sanitize(mended)[1] == ()
+
+
+def test_alpha_is_mended_where_it_is_not_finite_and_keeps_a_filters_lobes(render: SyntheticRender) -> None:
+    alpha = np.ones((*render.reference.shape[:2], 1), np.float32)
+    alpha[0, 0], alpha[0, 1] = -0.1, 1.2
+    assert sanitize(replace(render.buffers, alpha=alpha))[0].alpha is alpha
+    damaged = alpha.copy()
+    damaged[5, 5], damaged[9, 9], damaged[9, 10] = np.nan, np.inf, -np.inf
+    before = damaged.tobytes()
+    mended, lines = sanitize(replace(render.buffers, alpha=damaged))
+    assert mended.alpha is not None
+    np.testing.assert_array_equal(mended.alpha, alpha)
+    assert [line for line in lines if "alpha" in line] == ["repaired alpha 1 NaN, 2 infinite"]
+    assert damaged.tobytes() == before
 
 
 @pytest.mark.parametrize(

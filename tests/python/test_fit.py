@@ -273,6 +273,21 @@ def test_no_light_where_nothing_is_covered(
         assert (image[glow] > 0).all()
 
 
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_an_alpha_that_is_not_finite_is_repaired_and_told(
+    preset: Literal["draft", "paper"], render: SyntheticRender
+) -> None:
+    color = render.buffers.color
+    alpha = np.ones((*color.mean.shape[:2], 1), np.float32)
+    alpha[:20], alpha[3, 3], alpha[4:6, 4], alpha[8, 8] = 0, np.nan, np.inf, -np.inf
+    settings = _settings() if preset == "draft" else FitSettings("paper", iterations=2, inputs="random")
+    result = denoise(RenderBuffers(color, alpha=alpha), settings)
+    assert np.isfinite(result.color).all()
+    assert [note for note in result.notes if note.startswith("repaired")] == [
+        "repaired alpha 1 NaN, 3 infinite"
+    ]
+
+
 def test_halves_of_an_image_without_noise_are_copies(render: SyntheticRender) -> None:
     truth = render.reference
     half_a, half_b = truth, truth * np.float32(1.001)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
+from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 _PLANES = ("", " half A", " half B", " variance")
@@ -19,8 +21,8 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
     The energy of a filter's negative lobes is taken from the radiance around, so that the mean is preserved.
     Everything else, also normals of 1e6 and an albedo of 1e12 and more, is rebuilt: the mean and the halves
     from one another, a variance from the halves, and what remains from the valid pixels around it or, far
-    from any, from the half that is valid. Arrays without defects are shared with ``buffers``, which are not
-    modified. ``threads`` None uses every core.
+    from any, from the half that is valid. Of alpha, NaN and Inf alone are repaired (`finite_alpha`). Arrays
+    without defects are shared with ``buffers``, which are not modified. ``threads`` None uses every core.
     """
     repaired: dict[str, Buffer | None] = {}
     lines = []
@@ -39,7 +41,23 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
         if found:
             repaired[quantity] = Buffer(*planes)
             lines.append(f"repaired {'; '.join(found)}")
+    if buffers.alpha is not None:
+        alpha, found_in_alpha = finite_alpha(buffers.alpha, threads)
+        if found_in_alpha:
+            buffers = replace(buffers, alpha=alpha)
+            lines.append(f"repaired alpha {found_in_alpha}")
     return buffers.with_quantities(**repaired), tuple(lines)
+
+
+def finite_alpha(alpha: FloatImage, threads: int | None = None) -> tuple[FloatImage, str]:
+    """Return an alpha, shape (height, width, 1), rebuilt where it is NaN or infinite, and how many values.
+
+    1e6 and more counts as infinite. What a filter's lobes leave below 0 or above 1 stays. Without defects,
+    ``alpha`` itself is returned, and an empty text.
+    """
+    # The rules of normals hold for it, too.
+    (finite, *_), (defects, *_) = _core.sanitize("normal", alpha, None, None, None, thread_count(threads))
+    return finite, _counts(defects)
 
 
 def with_depth_ahead(depth: Buffer) -> Buffer:

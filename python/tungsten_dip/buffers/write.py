@@ -2,7 +2,8 @@
 
 A denoised EXR holds, in one file:
 
-- R, G, B (and A) at the top level: the denoised picture, float32 or float16;
+- R, G, B (and A, in which only NaN and Inf are repaired) at the top level: the denoised picture, float32 or
+  float16;
 - layer ``error``: the estimated squared relative error of every pixel, where known;
 - every channel of the input bit for bit, in its own pixel type. Input channels whose names are taken (in
   upper or lower case, and a grey picture's) move to the layer ``noisy``; the parts of a multi-part input
@@ -27,6 +28,7 @@ from tungsten_dip.buffers.atomic import check_suffix
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
 from tungsten_dip.buffers.render_buffers import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
+from tungsten_dip.buffers.sanitize import finite_alpha
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError, check_type
 
@@ -94,8 +96,10 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
         added |= _channels("error.", "Y", _stored("the error", error, float16))
     single = len(source.parts) == 1
     kept = source.parts[0].channels if single else {}
-    if buffers.alpha is not None and "A" not in kept:
-        added["A"] = buffers.alpha[..., 0]
+    if buffers.alpha is not None:
+        alpha, defects = finite_alpha(buffers.alpha, result.settings.threads)
+        if defects or "A" not in kept:
+            added["A"] = alpha[..., 0]
     moved_to = "noisy"
     while any(name.startswith(moved_to + ".") for name in kept):
         moved_to += "_"

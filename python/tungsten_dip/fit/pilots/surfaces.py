@@ -184,7 +184,7 @@ def alpha_as_albedo(buffers: RenderBuffers) -> FloatImage | None:
     """
     if buffers.albedo is not None or buffers.alpha is None:
         return None
-    alpha: FloatImage = np.clip(np.nan_to_num(buffers.alpha), 0, 1)
+    alpha: FloatImage = np.clip(buffers.alpha, 0, 1)  # of a filter's lobes
     return alpha
 
 
