@@ -25,7 +25,7 @@ import OpenImageIO as oiio  # noqa: N813 (the name that its documentation uses)
 
 from tungsten_dip.buffers.atomic import check_suffix, is_utf8, replacing
 from tungsten_dip.buffers.exr_header import escaped, read_headers
-from tungsten_dip.buffers.render_buffers import FloatArray, Quantity, as_float32, check_array
+from tungsten_dip.buffers.render_buffers import TRAITS, FloatArray, Quantity, as_float32, check_array
 from tungsten_dip.buffers.source import Channel, Part
 from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
@@ -80,7 +80,7 @@ _ENCODING = {
 
 def radiance_suffixes(quantity: Quantity) -> tuple[str, ...]:
     """Return the formats that hold a quantity, in the order of preference: .hdr holds no sign."""
-    return tuple(suffix for suffix in RADIANCE_SUFFIXES if quantity != "normal" or suffix != ".hdr")
+    return tuple(suffix for suffix in RADIANCE_SUFFIXES if suffix != ".hdr" or not TRAITS[quantity].signed)
 
 
 def with_known_suffix(path: Path, suffixes: tuple[str, ...] = RADIANCE_SUFFIXES) -> Path:

@@ -15,18 +15,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from tungsten_dip.buffers.render_buffers import CHANNELS
+from tungsten_dip.buffers.render_buffers import CHANNELS, TRAITS
 from tungsten_dip.errors import InputError
 
-ALIASES = {
-    "color": ("noisy image", "noisy", "color", "", "rgba", "beauty", "combined", "ci"),
-    "albedo": ("denoising albedo", "denoise_albedo", "albedo", "diffuse_albedo", "diffcol", "diffuse color"),
-    "normal": ("denoising normal", "n_noice", "normal", "normals", "sh_normal", "ns", "nn", "n"),
-    "depth": ("denoising depth", "z_noice", "depth", "dd.y", "dd", "z"),
-    "visibility": ("visibility",),
+ALIASES: dict[str, tuple[str, ...]] = {
+    **{quantity: traits.layers for quantity, traits in TRAITS.items()},
     "spp": ("spp",),
 }
-"""Layer names of every quantity in lower case, best first. The empty name is the top level."""
+"""The names of layers, as in `Traits`, of every quantity and of the number of samples."""
 
 _NOISY = ALIASES["color"][:2]
 _SHOWN = ("combined", "rgba")

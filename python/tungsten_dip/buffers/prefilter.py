@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import FEATURES, TRAITS, Buffer, FloatImage, RenderBuffers
 from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 1, 0.35), (4, 2, 0.5), (5, 1, 0.7))
@@ -22,7 +22,7 @@ def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> Re
     ``threads`` None uses every core.
     """
     filtered = {
-        name: prefilter_feature(feature, _PASSES, thread_count(threads), signed=name == "normal")
+        name: prefilter_feature(feature, _PASSES, thread_count(threads), signed=TRAITS[name].signed)
         for name in FEATURES
         if (feature := buffers.get(name)) is not None
     }

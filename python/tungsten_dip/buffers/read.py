@@ -30,6 +30,7 @@ from tungsten_dip.buffers.layers import (
 from tungsten_dip.buffers.render_buffers import (
     CHANNELS,
     MOST_SPP,
+    TRAITS,
     Buffer,
     FloatImage,
     RenderBuffers,
@@ -41,10 +42,11 @@ from tungsten_dip.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 
-_CHANNEL_COUNT = {q + suffix: count for q, count in CHANNELS.items() for suffix in PLANES.values()} | {
-    "alpha": 1,
-    "spp": 1,
+_CHANNELS = {q + suffix: traits.channels for q, traits in TRAITS.items() for suffix in PLANES.values()} | {
+    "alpha": "A",
+    "spp": "Y",
 }
+"""Channels as in `Traits`, by the key of --map."""
 
 _OTHER_FILE = "save its file with what is expected"
 """What to do about the layers of a file whose layers --map does not choose."""
@@ -342,13 +344,13 @@ def _share(stacked: FloatImage, sources: list[tuple[Part, str]]) -> None:
 
 
 def _with_channel_count(image: FloatImage, path: Path, key: str, names: tuple[str, ...]) -> FloatImage:
-    """Make one channel of equal ones, and three equal channels of one."""
-    given, count = image.shape[2], _CHANNEL_COUNT.get(key, 1)
+    """Make one channel of equal ones, and red, green and blue of grey."""
+    given, count = image.shape[2], len(_CHANNELS[key])
     if given == count:
         return image
     if count == 1 and all(np.array_equal(image[..., 0], image[..., k], equal_nan=True) for k in range(given)):
         return np.ascontiguousarray(image[..., :1])
-    if count == 3 and given == 1 and not key.startswith("normal"):
+    if _CHANNELS[key] == "RGB" and given == 1:
         return np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
     remedy = f"choose with --map {key}=CHANNEL" if _maps_layers(path) else _OTHER_FILE
     raise InputError(f"{path}: {key}: expected {count} channels, found {', '.join(names)}; {remedy}")

@@ -33,11 +33,46 @@ Indices = npt.NDArray[np.int64]
 
 Quantity = Literal["color", "albedo", "normal", "depth", "visibility"]
 
-CHANNELS: dict[Quantity, int] = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1}
-"""Channel count of every quantity a renderer may write."""
 
-FEATURES: tuple[Quantity, ...] = ("albedo", "normal", "depth")
-"""The quantities that guide a fit. Visibility, one random shadow ray a sample, is as noisy as the colour."""
+@dataclass(frozen=True)
+class Traits:
+    """What a quantity is.
+
+    ``channels`` are the names of its channels in a layer of ours. ``layers`` are the names that renderers
+    give to its layer, in lower case, best first; the empty one is the top level. Features guide a fit. What
+    is ``signed`` may be negative.
+    """
+
+    channels: str
+    layers: tuple[str, ...]
+    is_feature: bool = False
+    signed: bool = False
+
+
+TRAITS: dict[Quantity, Traits] = {
+    "color": Traits("RGB", ("noisy image", "noisy", "color", "", "rgba", "beauty", "combined", "ci")),
+    "albedo": Traits(
+        "RGB",
+        ("denoising albedo", "denoise_albedo", "albedo", "diffuse_albedo", "diffcol", "diffuse color"),
+        is_feature=True,
+    ),
+    "normal": Traits(
+        "XYZ",
+        ("denoising normal", "n_noice", "normal", "normals", "sh_normal", "ns", "nn", "n"),
+        is_feature=True,
+        signed=True,
+    ),
+    "depth": Traits("Y", ("denoising depth", "z_noice", "depth", "dd.y", "dd", "z"), is_feature=True),
+    # No feature: one random shadow ray a sample is as noisy as the colour.
+    "visibility": Traits("Y", ("visibility",)),
+}
+"""Every quantity that a renderer may write."""
+
+CHANNELS: dict[Quantity, int] = {quantity: len(traits.channels) for quantity, traits in TRAITS.items()}
+"""The number of its channels."""
+
+FEATURES: tuple[Quantity, ...] = tuple(quantity for quantity, traits in TRAITS.items() if traits.is_feature)
+"""The quantities that guide a fit."""
 
 MOST_SPP = 2**31 - 1
 """Renderers count in 32 bits."""

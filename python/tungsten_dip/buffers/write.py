@@ -27,7 +27,14 @@ import numpy as np
 from tungsten_dip.buffers.atomic import check_suffix
 from tungsten_dip.buffers.image_file import RADIANCE_SUFFIXES, write_exr
 from tungsten_dip.buffers.layers import PLANES
-from tungsten_dip.buffers.render_buffers import CHANNELS, FloatImage, RenderBuffers, as_float32, check_array
+from tungsten_dip.buffers.render_buffers import (
+    CHANNELS,
+    TRAITS,
+    FloatImage,
+    RenderBuffers,
+    as_float32,
+    check_array,
+)
 from tungsten_dip.buffers.sanitize import finite_alpha
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
 from tungsten_dip.errors import InputError, check_type
@@ -41,8 +48,6 @@ _DENOISED_PART = "tungsten_dip denoised"
 
 _GREY = ("Y",)
 """Channels of a picture that must not be in one layer with another one's red, green and blue."""
-
-_COMPONENTS = {"color": "RGB", "albedo": "RGB", "normal": "XYZ", "depth": "Y", "visibility": "Y"}
 
 
 @runtime_checkable
@@ -179,7 +184,7 @@ def _source_from_buffers(buffers: RenderBuffers) -> Source:
     channels: dict[str, Channel] = {}
     for quantity, buffer in buffers.quantities():
         for field, plane in buffer.planes():
-            channels |= _channels(f"{quantity}{PLANES[field]}.", _COMPONENTS[quantity], plane)
+            channels |= _channels(f"{quantity}{PLANES[field]}.", TRAITS[quantity].channels, plane)
     if buffers.alpha is not None:
         channels["color.A"] = buffers.alpha[..., 0]
     if isinstance(buffers.spp, np.ndarray):
