@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from tungsten_dip.buffers.image_file import write_image
     from tungsten_dip.buffers.read import read_buffers, read_image
     from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
-    from tungsten_dip.buffers.write import write_denoised
     from tungsten_dip.errors import InputError
     from tungsten_dip.fit import denoise
     from tungsten_dip.fit.model import Model
     from tungsten_dip.fit.result import FitResult, HistoryPoint
     from tungsten_dip.fit.settings import FitSettings
+    from tungsten_dip.fit.write import write_denoised
     from tungsten_dip.hosts import render
     from tungsten_dip.onnx import infer, load_model, save_model
     from tungsten_dip.report.metrics import Comparison, compare
@@ -49,7 +49,7 @@ _MODULE_BY_NAME = {
     "read_image": "buffers.read",
     "render": "hosts",
     "save_model": "onnx",
-    "write_denoised": "buffers.write",
+    "write_denoised": "fit.write",
     "write_image": "buffers.image_file",
 }
 

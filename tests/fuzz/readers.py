@@ -12,8 +12,8 @@ import numpy as np
 
 from synthetic import synthetic_render
 from tungsten_dip.buffers.read import read_buffers
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.scene.effects import inspect_facts
 from tungsten_dip.scene.meshes import TriangleMesh, read_curves, read_mesh, with_smooth_normals

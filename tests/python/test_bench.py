@@ -26,11 +26,12 @@ from tungsten_dip.bench.table import Row, SetRows, markdown_table
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.read import read_image
 from tungsten_dip.buffers.render_buffers import RenderBuffers
-from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.cli import tungsten_dip as command
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.progress import silent
 from tungsten_dip.report.metrics import Comparison, compare
 

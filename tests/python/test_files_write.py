@@ -29,10 +29,11 @@ from tungsten_dip.buffers.image_file import MOST_HDR, write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers, read_image
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
-from tungsten_dip.buffers.write import write_denoised, write_tungsten_folder
+from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.write import write_denoised
 
 Channels = dict[str, np.ndarray]
 
@@ -335,7 +336,7 @@ def test_a_result_of_other_buffers_or_another_name_is_refused(tmp_path: Path) ->
         )
     with pytest.raises(InputError, match="buffers: expected RenderBuffers, got NoneType; give those"):
         write_denoised(tmp_path / "out.exr", result_for(buffers), None)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="result: expected Denoised, got ndarray; give what denoise"):
+    with pytest.raises(InputError, match="result: expected FitResult, got ndarray; give what denoise"):
         write_denoised(tmp_path / "out.exr", result_for(buffers).color, buffers)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"ends in \.exr"):
         write_denoised(tmp_path / "out.png", result_for(buffers), buffers)

@@ -16,10 +16,10 @@ import pytest
 
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import RenderBuffers
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.hosts.mitsuba.render import _scene_with_integrator, _Statistics, render_translated
 from tungsten_dip.hosts.mitsuba.runtime import VERSION, mitsuba_variant
 from tungsten_dip.hosts.mitsuba.translated_scene import TranslatedScene

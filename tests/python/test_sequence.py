@@ -13,11 +13,11 @@ from tungsten_dip.buffers.image_file import write_exr, write_image
 from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.network import blend_network, training
 from tungsten_dip.fit.presets import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.graphs.sessions import session_from_proto
 from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, ThinlensCamera
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker

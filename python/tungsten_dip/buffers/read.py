@@ -187,7 +187,7 @@ def _channels_of_file(key: str, parts: Sequence[Part]) -> dict[str, Channel]:
 
 
 def _unwrapped(path: Path, parts: tuple[Part, ...]) -> tuple[Source, dict[str, Any]]:
-    """Undo what write_denoised did: drop what it added, put back what it moved."""
+    """Undo what `write_layers` did: drop what it added, put back what it moved."""
     first, *others = parts
     attributes = first.attributes
     if ADDED not in attributes:

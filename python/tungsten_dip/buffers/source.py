@@ -15,10 +15,10 @@ OWN = "tungsten_dip/"
 """Prefix of the names of our own attributes."""
 
 ADDED = OWN + "added"
-"""Attribute: the channels of the first part that write_denoised added."""
+"""Attribute: the channels of the first part that `write_layers` added."""
 
 MOVED_TO = OWN + "moved_to"
-"""Attribute: the layer that holds input channels whose names write_denoised needed itself."""
+"""Attribute: the layer that holds input channels whose names `write_layers` needed itself."""
 
 MAP = OWN + "map"
 """Attribute: the --map of the input, as JSON."""

@@ -1,6 +1,6 @@
-"""Results and buffers into files.
+"""Buffers into files, with or without images that were made of them.
 
-A denoised EXR holds, in one file:
+A denoised EXR (`write_layers`) holds, in one file:
 
 - R, G, B (and A, in which only NaN and Inf are repaired) at the top level: the denoised picture, float32 or
   float16;
@@ -16,11 +16,9 @@ A denoised EXR holds, in one file:
 from __future__ import annotations
 
 import json
-import logging
-from dataclasses import asdict
-from importlib import metadata
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -32,17 +30,10 @@ from tungsten_dip.buffers.render_buffers import (
     TRAITS,
     FloatImage,
     RenderBuffers,
-    as_float32,
-    check_array,
 )
 from tungsten_dip.buffers.sanitize import finite_alpha
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
-from tungsten_dip.errors import InputError, check_type
-
-_LOG = logging.getLogger(__name__)
-
-_MOST_LOST = 0.01
-"""The part of an image that half floats may lose: too little to be seen. Rounding loses 1 / 2048 at most."""
+from tungsten_dip.errors import InputError
 
 _DENOISED_PART = "tungsten_dip denoised"
 
@@ -50,59 +41,30 @@ _GREY = ("Y",)
 """Channels of a picture that must not be in one layer with another one's red, green and blue."""
 
 
-@runtime_checkable
-class Denoised(Protocol):
-    """The part of the result of a fit that is saved."""
+def write_layers(
+    path: Path,
+    layers: Mapping[str, Channel],
+    facts: Mapping[str, Any],
+    buffers: RenderBuffers,
+    threads: int | None = None,
+) -> None:
+    """Write images together with the buffers they were made from (see the top of this file).
 
-    @property
-    def color(self) -> FloatImage:
-        """Linear radiance, shape (height, width, 3)."""
+    ``layers`` are images of shape (height, width, 1 or 3) by the names of their layers; the empty name is the
+    top level, the picture's. ``facts`` become attributes of our own. ``threads`` None uses every core.
 
-    @property
-    def error(self) -> FloatImage | None:
-        """Estimated squared relative error, shape (height, width, 1)."""
-
-    @property
-    def settings(self) -> Any:
-        """A dataclass with fields ``seed`` and ``threads``."""
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the fit."""
-
-    @property
-    def iterations(self) -> int:
-        """Number of training steps."""
-
-    @property
-    def estimated_relmse(self) -> float | None:
-        """The mean of ``error``."""
-
-
-def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, float16: bool = False) -> None:
-    """Write the denoised picture together with the buffers it was made from (see the top of this file).
-
-    With ``float16``, the picture and the error are stored as 16 bit floats, unless their values are too large
-    or too small for that. Settings, seed, seconds, iterations, the estimated relMSE and the version become
-    attributes.
-
-    Raises InputError if the file is no .exr or cannot be written, or the result is none, of another size than
-    the buffers, or no numbers; an existing file then stays as it was.
+    Raises InputError if the file is no .exr or cannot be written; an existing file then stays as it was.
     """
-    path = Path(path)
     check_suffix(path, ".exr")
-    check_type("result", result, Denoised, "give what denoise returned, not its image alone")
-    check_type("buffers", buffers, RenderBuffers, "give those that the result was made from")
-    color = _of_result("color", result.color, buffers, 3)
     source = buffers.source or _source_from_buffers(buffers)
-    added: dict[str, Channel] = _channels("", "RGB", _stored("the picture", color, float16))
-    if result.error is not None:
-        error = _of_result("error", result.error, buffers, 1)
-        added |= _channels("error.", "Y", _stored("the error", error, float16))
+    added: dict[str, Channel] = {}
+    for layer, image in layers.items():
+        names = "RGB" if image.shape[2] == 3 else "Y"
+        added |= _channels(f"{layer}." if layer else "", names, image)
     single = len(source.parts) == 1
     kept = source.parts[0].channels if single else {}
     if buffers.alpha is not None:
-        alpha, defects = finite_alpha(buffers.alpha, result.settings.threads)
+        alpha, defects = finite_alpha(buffers.alpha, threads)
         if defects or "A" not in kept:
             added["A"] = alpha[..., 0]
     moved_to = "noisy"
@@ -110,19 +72,13 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
         moved_to += "_"
     taken = {name.upper() for name in (*added, *_GREY)}
     kept = {f"{moved_to}.{name}" if name.upper() in taken else name: plane for name, plane in kept.items()}
-    own: dict[str, Any] = {
-        OWN + "version": metadata.version("tungsten-dip"),
-        OWN + "seed": str(result.settings.seed),
-        OWN + "settings": json.dumps(asdict(result.settings)),
-        OWN + "seconds": result.seconds,
-        OWN + "iterations": result.iterations,
+    own = {
+        **{OWN + name: value for name, value in facts.items()},
         ADDED: sorted(added),
         MOVED_TO: moved_to,
         MAP: json.dumps(dict(source.mapping)),
+        **_spp(buffers),
     }
-    if result.estimated_relmse is not None:
-        own[OWN + "estimated_relmse"] = result.estimated_relmse
-    own |= _spp(buffers)
     attributes = {**_frame(buffers), **buffers.attributes, **own}
     if single:
         parts = [Part(added | kept, attributes, source.parts[0].name)]
@@ -131,7 +87,7 @@ def write_denoised(path: str | Path, result: Denoised, buffers: RenderBuffers, f
         while any(part.name == name for part in source.parts):
             name += "_"
         parts = [Part(added, attributes, name), *source.parts]
-    write_exr(path, parts, result.settings.threads)
+    write_exr(path, parts, threads)
 
 
 def write_error_map(path: Path, error: FloatImage, buffers: RenderBuffers) -> None:
@@ -201,34 +157,6 @@ def _frame(buffers: RenderBuffers) -> dict[str, Any]:
 
 def _channels(prefix: str, names: str, image: Channel) -> dict[str, Channel]:
     return {prefix + name: image[..., index] for index, name in enumerate(names)}
-
-
-def _of_result(name: str, image: FloatImage, buffers: RenderBuffers, channels: int) -> FloatImage:
-    """Return an image of a result, which may have been graded in another type, as float32."""
-    check_array(f"result {name}", image)
-    expected = (buffers.height, buffers.width, channels)
-    if image.shape != expected:
-        raise InputError(
-            f"result {name}: expected shape {expected} as the buffers have it, got {image.shape}; give the "
-            f"buffers that it was made from"
-        )
-    return as_float32(f"result {name}", image)
-
-
-def _stored(label: str, image: FloatImage, float16: bool) -> Channel:
-    if not float16:
-        return image
-    finite = image[np.isfinite(image)]
-    with np.errstate(over="ignore"):
-        lost = np.abs(finite.astype(np.float16) - finite).sum(dtype=np.float64)
-    if lost > _MOST_LOST * np.abs(finite).sum(dtype=np.float64):
-        _LOG.warning(
-            "%s has values that half floats cannot hold (beyond 65504, or mostly below 6e-8): stored as "
-            "float32",
-            label,
-        )
-        return image
-    return image.astype(np.float16)
 
 
 def _spp(buffers: RenderBuffers) -> dict[str, float]:

@@ -14,7 +14,6 @@ from typing import Literal, NoReturn, TypeVar
 from tungsten_dip.buffers.atomic import check_writable, write_text
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.render_buffers import CHANNELS, RenderBuffers
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.cli.console import minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
@@ -36,6 +35,7 @@ from tungsten_dip.cli.tungsten_options import (
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitResult, FitSettings, check_ready
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.hosts import chosen_host, native
 from tungsten_dip.hosts import tungsten as tungsten_host
 from tungsten_dip.hosts.mitsuba.render import render as render_with_mitsuba

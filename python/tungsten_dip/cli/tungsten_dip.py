@@ -16,7 +16,7 @@ from tungsten_dip.buffers.atomic import check_writable, write_text
 from tungsten_dip.buffers.image_file import first_pixel
 from tungsten_dip.buffers.read import input_files, read_buffers, read_image
 from tungsten_dip.buffers.render_buffers import RenderBuffers
-from tungsten_dip.buffers.write import write_denoised, write_error_map
+from tungsten_dip.buffers.write import write_error_map
 from tungsten_dip.cli.bench import add_bench
 from tungsten_dip.cli.console import (
     Parser,
@@ -49,6 +49,7 @@ from tungsten_dip.errors import InputError, whole_number
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettings, Inputs, Preset
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.report.page import report_page

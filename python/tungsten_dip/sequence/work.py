@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 from tungsten_dip.buffers.image_file import is_whole, read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_camera
 from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
