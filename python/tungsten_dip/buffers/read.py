@@ -334,7 +334,7 @@ def _full_names(parts: Sequence[Part]) -> dict[str, tuple[Part, str]]:
 
 
 def _share(stacked: FloatImage, sources: list[tuple[Part, str]]) -> None:
-    """Let channels that were read be views of the image made of them: at 4K that saves more than a GiB.
+    """Let channels that were read be views of the image made of them (`Part`).
 
     In place: what was read is freed image by image, whoever else holds its part.
     """

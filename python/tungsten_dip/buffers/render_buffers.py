@@ -128,7 +128,8 @@ class RenderBuffers:
     ``spp`` is the number of samples per pixel, one number or shape (height, width, 1) where it varies (0 in
     pixels without a sample). ``alpha`` has shape (height, width, 1). ``attributes`` is metadata of the source
     that travels to the output, ``source`` the channels of the file that was read, in their own pixel types,
-    for the same purpose (None for buffers that are not, or no longer, those of a file).
+    for the same purpose. Its file holds exactly these images and samples: ``source`` becomes None if one of
+    them is another than the one that was read, as after `dataclasses.replace`.
 
     Raises InputError if a quantity is no Buffer, the shapes or the channel counts do not fit together, an
     array is not C-contiguous float32, or ``spp`` is neither a number above 0 nor an array of such and 0.
@@ -167,7 +168,6 @@ class RenderBuffers:
         if self.source and any(
             _differs(getattr(self, name), self.source.read.get(name)) for name in (*CHANNELS, "alpha", "spp")
         ):
-            # `dataclasses.replace` changed this, and took along the file that does not hold it.
             object.__setattr__(self, "source", None)
 
     @property

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ Channel = npt.NDArray[Any]
 class Part:
     """One image of a file: its channels in the order of the file, and the attributes of its (EXR) header.
 
-    The data window and the display window are among the attributes where they matter.
+    The data window and the display window are among the attributes where they matter. What was read as
+    float32 becomes, in place, a view of the image that `read_buffers` makes of it: at 4K, a second copy of
+    all channels would take more than a GiB.
     """
 
     channels: dict[str, Channel]
@@ -51,6 +54,12 @@ class Part:
         height, width = next(iter(self.channels.values())).shape
         return int(column), int(row), width, height
 
+    @property
+    def is_crop(self) -> bool:
+        """Whether these pixels are others than those to be displayed: EXR's two windows differ."""
+        data, display = (self.attributes.get(name, ()) for name in ("dataWindow", "displayWindow"))
+        return not np.array_equal(data, display)
+
 
 @dataclass(frozen=True)
 class Source:
@@ -63,3 +72,8 @@ class Source:
     mapping: Mapping[str, str] = field(default_factory=dict)
     color_part: int = 0
     read: Mapping[str, Buffer | Channel | float | None] = field(default_factory=dict)
+
+    @property
+    def main(self) -> Part:
+        """The part that holds the colour."""
+        return self.parts[self.color_part]

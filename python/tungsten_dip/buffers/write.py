@@ -150,8 +150,7 @@ def _source_from_buffers(buffers: RenderBuffers) -> Source:
 
 def _frame(buffers: RenderBuffers) -> dict[str, Any]:
     """Return where the pixels were in the file that was read, if any."""
-    source = buffers.source
-    attributes = source.parts[source.color_part].attributes if source else {}
+    attributes = buffers.source.main.attributes if buffers.source else {}
     return {key: value for key, value in attributes.items() if key in FRAME}
 
 

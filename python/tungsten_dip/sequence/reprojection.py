@@ -52,9 +52,8 @@ def check_camera(camera: Camera, buffers: RenderBuffers) -> None:
         )
     # A picture of the camera's size is whole, also if only a part of it is to be displayed.
     if buffers.source is not None and (buffers.width, buffers.height) != (width, height):
-        part = buffers.source.parts[buffers.source.color_part]
-        data, display = (part.attributes.get(name, ()) for name in ("dataWindow", "displayWindow"))
-        if not np.array_equal(data, display):
+        part = buffers.source.main
+        if part.is_crop:
             column, row, width, height = part.window
             raise InputError(
                 f"expected all that the camera takes, got {width}x{height} pixels from ({column}, {row}) of "
