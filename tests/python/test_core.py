@@ -13,7 +13,15 @@ from synthetic import SyntheticRender, synthetic_render
 from tungsten_dip import _core
 from tungsten_dip.buffers.half_buffers import compare_halves
 from tungsten_dip.buffers.prefilter import noise_in, prefilter_features
-from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import (
+    CHANNELS,
+    FEATURES,
+    TRAITS,
+    Buffer,
+    FloatImage,
+    Quantity,
+    RenderBuffers,
+)
 from tungsten_dip.buffers.sanitize import sanitize
 
 SIZES = [(1, 1), (1, 9), (9, 1), (7, 5), (65, 67), (0, 4), (4, 0)]
@@ -91,6 +99,13 @@ def test_the_gradient_of_a_norm_takes_images_of_one_shape_alone() -> None:
     for y, gradient in ((x, x.T.copy()), (x.T.copy(), x), (x, x.ravel())):
         with pytest.raises(ValueError, match="in the shape of x"):
             _core.norm_act_gradient(gradient, x, three, three, 1e-5, 0.2, y, three, three)
+
+
+@pytest.mark.parametrize("quantity", TRAITS)
+def test_the_core_knows_every_quantity_and_which_may_be_negative(quantity: Quantity) -> None:
+    image = np.full((2, 3, CHANNELS[quantity]), -1, np.float32)
+    _, (found, *_) = _core.sanitize(quantity, image, None, None, None, 2)
+    assert (found.negative == 0) == TRAITS[quantity].signed
 
 
 def test_sane_buffers_are_shared(render: SyntheticRender) -> None:

@@ -280,7 +280,7 @@ def test_an_alpha_that_is_not_finite_is_repaired_and_told(
     color = render.buffers.color
     alpha = np.ones((*color.mean.shape[:2], 1), np.float32)
     alpha[:20], alpha[3, 3], alpha[4:6, 4], alpha[8, 8] = 0, np.nan, np.inf, -np.inf
-    settings = _settings() if preset == "draft" else FitSettings("paper", iterations=2, inputs="random")
+    settings = short() if preset == "draft" else FitSettings("paper", iterations=2, inputs="random")
     result = denoise(RenderBuffers(color, alpha=alpha), settings)
     assert np.isfinite(result.color).all()
     assert [note for note in result.notes if note.startswith("repaired")] == [

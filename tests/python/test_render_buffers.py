@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from fractions import Fraction
+from typing import get_args
 
 import numpy as np
 import pytest
 
 import tungsten_dip as dip
-from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers, mean_of, variance_of_mean
+from tungsten_dip.buffers.render_buffers import (
+    TRAITS,
+    Buffer,
+    Quantity,
+    RenderBuffers,
+    mean_of,
+    variance_of_mean,
+)
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit.result import FitResult
 from tungsten_dip.fit.settings import FitSettings
@@ -18,6 +26,11 @@ from tungsten_dip.fit.settings import FitSettings
 GREY = np.full((4, 5, 3), 0.5, np.float32)
 NOISY = RenderBuffers(Buffer(GREY))
 RESULT = FitResult(GREY, FitSettings(), seconds=0, iterations=0)
+
+
+def test_what_the_quantities_are_is_told_of_each():
+    buffers = [field.name for field in fields(RenderBuffers) if str(field.type).startswith("Buffer")]
+    assert buffers == list(TRAITS) == list(get_args(Quantity))
 
 
 def unaligned() -> np.ndarray:

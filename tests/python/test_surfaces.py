@@ -9,7 +9,14 @@ import pytest
 
 from fitted_models import check_result, short, surfaces_of
 from synthetic import SyntheticRender, buffer_of_halves, relmse, rgb_from_plane
-from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
+from tungsten_dip.buffers.render_buffers import (
+    CHANNELS,
+    FEATURES,
+    Buffer,
+    FloatImage,
+    Quantity,
+    RenderBuffers,
+)
 from tungsten_dip.fit import FitSettings, denoise
 from tungsten_dip.fit.pilots.surfaces import Surfaces, divisor
 
@@ -223,3 +230,13 @@ def test_light_that_one_half_saw_by_chance_is_noise(render: SyntheticRender) -> 
     image = denoise(with_lamp("half_a"), short(iterations=20)).color
     around = np.delete(image[18:23, 28:33].reshape(25, 3), 12, axis=0)
     assert image[20, 30].mean() < 2 * around.mean()
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_distinguishes_surfaces(feature: Quantity) -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (20, 24, CHANNELS[feature])).astype(np.float32)
+    grey = rgb_from_plane(np.full((20, 24), 0.5))
+    buffers = RenderBuffers(buffer_of_halves(grey, grey))
+    buffers = buffers.with_quantities(**{feature: buffer_of_halves(image, image)})
+    for surfaces in surfaces_of(buffers):
+        assert [name.partition(".")[0] for name in surfaces.names] == [feature] * CHANNELS[feature]
