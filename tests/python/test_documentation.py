@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from synthetic import SyntheticRender
+from tungsten_dip.buffers.render_buffers import TRAITS, Quantity
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.fit import FitResult
 
@@ -36,6 +37,14 @@ def test_every_field_of_a_result_is_documented() -> None:
     table = page.partition("The fields of `result`")[2].partition("\n## ")[0]
     documented = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
     assert documented == [field.name for field in fields(FitResult)]
+
+
+@pytest.mark.parametrize("quantity", sorted(TRAITS.keys() - {"color"}))  # whose row holds the top level
+def test_the_layers_of_every_quantity_are_documented(quantity: Quantity) -> None:
+    row = re.search(rf"^\| {quantity} \| (.*) \|$", (ROOT / "docs" / "files.md").read_text(), re.MULTILINE)
+    assert row is not None
+    layers = re.findall(r"`([^`]+)`", row[1])
+    assert tuple(layer.lower() for layer in layers) == TRAITS[quantity].layers
 
 
 def anchors(page: Path) -> set[str]:

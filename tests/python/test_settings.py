@@ -10,9 +10,9 @@ import pytest
 
 from fitted_models import short
 from synthetic import SyntheticRender
-from tungsten_dip.buffers.write import write_denoised
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.write import write_denoised
 
 
 @pytest.mark.parametrize(
