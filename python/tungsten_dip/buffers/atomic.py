@@ -100,7 +100,10 @@ def _prefix(target: Path) -> str:
 
 
 def _end(target: Path) -> str:
-    """Return what they end with: a mark, lest a file of the user's with a date in its name pass for one."""
+    """Return what the names of temporary files end with.
+
+    It marks them, lest a file of the user's with a date in its name pass for one.
+    """
     return f".tungsten-dip{target.suffix}"
 
 

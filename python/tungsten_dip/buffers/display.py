@@ -1,4 +1,4 @@
-"""Linear radiance as 8-bit pictures show it (clipped to [0, 1], with a gamma of 2.2), and back; features."""
+"""Display values: linear radiance clipped to [0, 1] with a gamma of 2.2, and back; features as Tungsten's."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> Halves
 
     Halves of a low-discrepancy sampler mirror each other (Tungsten's Sobol sampler: correlation -0.2), and
     halves may be copies of one image. The correlation is taken of what a second-order difference leaves of
-    both halves; where texture makes it positive, the sample variance decides; without one, only
+    both halves. Where texture makes it positive, the variance of the colour decides; if that is unknown, only
     copies are taken for dependent. Without halves, and where the image does not show it, ``independent`` is
     False. Expects sanitised buffers.
     """

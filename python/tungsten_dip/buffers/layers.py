@@ -40,8 +40,11 @@ NOTHING = "none"
 
 _COMPONENTS = ("RGB", "XYZ", ("RED", "GREEN", "BLUE"))
 
-# The second moments that Mitsuba's integrator "moment" writes beside every layer.
 _NO_LAYER = "m2_"
+"""Begins the names of second moments, which Mitsuba's integrator "moment" writes beside every layer."""
+
+_COMPOSITE = "composite."
+"""Begins the names of Blender's layers that its compositor made, perhaps graded already."""
 
 Layers = dict[str, dict[str, str]]
 
@@ -183,9 +186,6 @@ def _layers(names: list[str]) -> Layers:
     return layers
 
 
-_COMPOSITE = "composite."
-
-
 def _view_layer(channel: str, layers: Layers) -> str:
     """Return what precedes the layer in the name of a channel, in lower case, with its dot.
 
@@ -212,7 +212,6 @@ def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
         for rank, alias in enumerate(ALIASES[quantity]):
             if name == alias or (alias and name.endswith("." + alias)):
                 prefix = name[: len(name) - len(alias)]
-                # Blender's "Composite" is what its compositor made, perhaps graded already.
                 strange = prefix == _COMPOSITE if quantity == "color" else prefix != color_prefix
                 if strange and prefix and color_prefix not in ("", _COMPOSITE):
                     break

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import get_args
 
 import numpy as np
 
 from tungsten_dip.buffers.display import ldr_from_radiance
 from tungsten_dip.buffers.render_buffers import FloatImage
-from tungsten_dip.errors import InputError
+from tungsten_dip.errors import check_choice
 from tungsten_dip.scene.types import TonemapName
 
 # Every curve is flat up here; beyond it the squares in the filmic one would overflow.
@@ -23,10 +22,7 @@ def display_from_radiance(radiance: FloatImage, tonemap: TonemapName = "gamma") 
 
     Raises InputError if Tungsten has no such tonemap.
     """
-    if tonemap not in _CURVES:
-        raise InputError(
-            f"tonemap: expected one of {', '.join(get_args(TonemapName))}, got {tonemap}; choose one"
-        )
+    check_choice("tonemap", tonemap, _CURVES)
     light = np.clip(np.nan_to_num(radiance, nan=0.0), 0.0, _SATURATED)
     return np.clip(_CURVES[tonemap](light), 0.0, 1.0).astype(np.float32)
 
