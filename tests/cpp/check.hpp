@@ -1,8 +1,11 @@
-// The whole test framework: CHECK counts what fails and says where; a test's main returns failed_checks().
+// The whole test framework: a check that fails says where, and what the values are; a test's main returns
+// failed_checks().
 #pragma once
 
 #include <cmath>
 #include <iostream>
+#include <string>
+#include <type_traits>
 
 inline int& failures() {
     static int count = 0;
@@ -13,15 +16,34 @@ inline int& checks() {
     return count;
 }
 
-inline void check(bool passed, const char* what, const char* file, int line) {
+struct Place {
+    const char* what;
+    const char* file;
+    int line;
+};
+
+template <typename... Parts>
+void check(bool passed, Place place, const Parts&... values) {
     ++checks();
     if (passed) return;
     ++failures();
-    std::cerr << file << ":" << line << ": " << what << "\n";
+    std::cerr.precision(9);  // tells any two floats apart
+    std::cerr << place.file << ":" << place.line << ": " << place.what;
+    (std::cerr << ... << values) << "\n";
 }
 
-inline bool near(double value, double expected, double tolerance) {
-    return std::abs(value - expected) <= tolerance;
+template <typename Value>
+void check_equal(const Value& value, const std::type_identity_t<Value>& expected, Place place) {
+    check(value == expected, place, ": expected ", expected, ", got ", value);
+}
+
+inline void check_near(double value, double expected, double tolerance, Place place) {
+    check(std::abs(value - expected) <= tolerance, place, ": expected ", expected, " within ", tolerance,
+          ", got ", value);
+}
+
+inline void check_below(double value, double bound, Place place) {
+    check(value < bound, place, ": expected less than ", bound, ", got ", value);
 }
 
 inline int failed_checks() {
@@ -29,4 +51,8 @@ inline int failed_checks() {
     return failures() == 0 && checks() > 0 ? 0 : 1;
 }
 
-#define CHECK(condition) check((condition), #condition, __FILE__, __LINE__)
+#define CHECK(condition) check(condition, {#condition, __FILE__, __LINE__})
+#define CHECK_EQUAL(value, expected) check_equal(value, expected, {#value, __FILE__, __LINE__})
+#define CHECK_NEAR(value, expected, tolerance) \
+    check_near(value, expected, tolerance, {#value, __FILE__, __LINE__})
+#define CHECK_BELOW(value, bound) check_below(value, bound, {#value, __FILE__, __LINE__})

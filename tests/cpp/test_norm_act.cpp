@@ -106,14 +106,14 @@ void values_and_gradients_are_those_of_the_definition(Size size, int channels) {
         return (above - below) / (2 * step);
     };
     for (std::size_t i = 0; i < x.size(); ++i) {
-        CHECK(near(value_of(example.y[i]), expected[i], 1e-5 + std::abs(expected[i]) / 256));
+        CHECK_NEAR(value_of(example.y[i]), expected[i], 1e-5 + std::abs(expected[i]) / 256);
         const double by_this = difference(x[i], 1e-5);
-        CHECK(near(value_of(by_x[i]), by_this, 1e-3 + std::abs(by_this) / 128));
+        CHECK_NEAR(value_of(by_x[i]), by_this, 1e-3 + std::abs(by_this) / 128);
     }
     constexpr double step = 1. / 65536;  // which a float of this size can take
     for (std::size_t c = 0; c < example.channels; ++c) {
-        CHECK(near(by_weight[c], difference(example.weight[c], step), 0.01));
-        CHECK(near(by_bias[c], difference(example.bias[c], step), 0.01));
+        CHECK_NEAR(by_weight[c], difference(example.weight[c], step), 0.01);
+        CHECK_NEAR(by_bias[c], difference(example.bias[c], step), 0.01);
     }
 }
 

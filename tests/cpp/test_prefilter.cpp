@@ -93,7 +93,7 @@ void agrees_with_the_definition() {
                     worst = std::max(worst, std::abs(out.half_a.at(y, x) - nl_means(render, window, y, x)));
                 }
             }
-            CHECK(worst < 1e-5);
+            CHECK_BELOW(worst, 1e-5);
         }
     }
 }
@@ -112,12 +112,14 @@ void removes_noise_and_keeps_edges() {
     for (const bool with_variance : {true, false}) {
         Render render = noisy_edge(40, 51, 2);
         Output out(render, 2, with_variance);
-        CHECK(squared_error(out.mean) < 0.2 * squared_error(render.mean));
-        CHECK(near(out.mean.at(20, 24), 1, 0.15) && near(out.mean.at(20, 25), 2, 0.15));
+        CHECK_BELOW(squared_error(out.mean), 0.2 * squared_error(render.mean));
+        CHECK_NEAR(out.mean.at(20, 24), 1, 0.15);
+        CHECK_NEAR(out.mean.at(20, 25), 2, 0.15);
         double remaining = 0;
         for (const float value : out.variance.values) remaining += value;
         remaining /= static_cast<double>(out.variance.values.size());
-        CHECK(remaining > 0 && remaining < 0.2 * 0.16 / 16);
+        CHECK(remaining > 0);
+        CHECK_BELOW(remaining, 0.2 * 0.16 / 16);
     }
 }
 
@@ -130,7 +132,9 @@ void leaves_clean_values_alone() {
         }
     }
     const Output clean(render, 1);
-    CHECK(clean.mean == render.mean && clean.half_a == render.half_a && clean.half_b == render.half_b);
+    CHECK(clean.mean == render.mean);
+    CHECK(clean.half_a == render.half_a);
+    CHECK(clean.half_b == render.half_b);
     CHECK(clean.variance == Pixels(70, 30, 1));
 
     // Noise below a thousandth of a value is none.
@@ -138,13 +142,14 @@ void leaves_clean_values_alone() {
         for (int x = 0; x < 30; ++x) render.half_a.at(y, x) *= 1 + 4e-4F * static_cast<float>(x % 2);
     }
     const Output nearly_clean(render, 1);
-    CHECK(nearly_clean.mean == render.mean && nearly_clean.half_a == render.half_a);
+    CHECK(nearly_clean.mean == render.mean);
+    CHECK(nearly_clean.half_a == render.half_a);
 
     render.half_a.at(2, 2) += 0.1F;  // noise elsewhere changes nothing here
     render.variance.at(2, 2) = 0.0025F;
     Output one_noisy(render, 1);
-    CHECK(one_noisy.mean.at(2, 3) == render.mean.at(2, 3) &&
-          one_noisy.mean.at(60, 3) == render.mean.at(60, 3));
+    CHECK_EQUAL(one_noisy.mean.at(2, 3), render.mean.at(2, 3));
+    CHECK_EQUAL(one_noisy.mean.at(60, 3), render.mean.at(60, 3));
 }
 
 void every_size_and_thread_count_works() {

@@ -62,10 +62,10 @@ void linear_colors_stay() {
         }
         const SearchWindow window{.radius = 6, .step = 2, .k = 1};
         const float penalty = 0.1F / (scale * scale);
-        CHECK(largest_difference(regressed(target, features, window, penalty), target) < 1e-3);
+        CHECK_BELOW(largest_difference(regressed(target, features, window, penalty), target), 1e-3);
         Pixels guide = noise(size, 3, 2);
         Pixels variance(size.height, size.width, 3, 0.5F);
-        CHECK(largest_difference(regressed(target, features, guide, variance, window), target) < 1e-3);
+        CHECK_BELOW(largest_difference(regressed(target, features, guide, variance, window), target), 1e-3);
     }
 }
 
@@ -119,7 +119,7 @@ void noise_falls_by_the_size_of_the_window() {
             }
         }
         const double expected = std::pow(variance_of_two_means(radius, step, step == 1 ? 1 : step + 1), 2);
-        CHECK(near(squares / count, expected, 0.15 * expected));
+        CHECK_NEAR(squares / count, expected, 0.15 * expected);
     }
 }
 

@@ -33,9 +33,13 @@ void counts_by_kind() {
     mean.at(1, 0) = inf;
     mean.at(1, 2) = -2.0F;
     const Defects color = find_defects(only_mean(mean), Quantity::color, 2).mean;
-    CHECK(color.nan == 1 && color.infinite == 2 && color.negative == 1);
+    CHECK_EQUAL(color.nan, 1);
+    CHECK_EQUAL(color.infinite, 2);
+    CHECK_EQUAL(color.negative, 1);
     const Defects normal = find_defects(only_mean(mean), Quantity::normal, 1).mean;
-    CHECK(normal.nan == 1 && normal.infinite == 2 && normal.negative == 0);
+    CHECK_EQUAL(normal.nan, 1);
+    CHECK_EQUAL(normal.infinite, 2);
+    CHECK_EQUAL(normal.negative, 0);
 }
 
 void mean_and_halves_follow_from_one_another() {
@@ -50,10 +54,12 @@ void mean_and_halves_follow_from_one_another() {
     render.half_a.at(0, 2) = inf;
     render.half_b.at(0, 2) = 8;  // 2 * 3 - 8 is negative: 0
     mend(render.buffer(), Quantity::color);
-    CHECK(render.mean.at(0, 0) == 3);
-    CHECK(render.half_b.at(0, 1) == 1);
-    CHECK(render.half_a.at(0, 2) == 0);
-    CHECK(render.mean.at(0, 3) == 1 && render.half_a.at(0, 3) == 1 && render.half_b.at(0, 3) == 1);
+    CHECK_EQUAL(render.mean.at(0, 0), 3);
+    CHECK_EQUAL(render.half_b.at(0, 1), 1);
+    CHECK_EQUAL(render.half_a.at(0, 2), 0);
+    CHECK_EQUAL(render.mean.at(0, 3), 1);
+    CHECK_EQUAL(render.half_a.at(0, 3), 1);
+    CHECK_EQUAL(render.half_b.at(0, 3), 1);
 }
 
 void lost_values_come_from_the_neighbours() {
@@ -61,13 +67,13 @@ void lost_values_come_from_the_neighbours() {
     mean.at(0, 0) = 1000;  // the median ignores a firefly
     mean.at(1, 1) = nan;
     mend(only_mean(mean), Quantity::color);
-    CHECK(mean.at(1, 1) == 2);
+    CHECK_EQUAL(mean.at(1, 1), 2);
 
     Pixels hole(40, 40, 1, nan);
     hole.at(0, 0) = 5;
     mend(only_mean(hole), Quantity::color);
-    CHECK(hole.at(16, 16) == 5);
-    CHECK(hole.at(17, 17) == 0);
+    CHECK_EQUAL(hole.at(16, 16), 5);
+    CHECK_EQUAL(hole.at(17, 17), 0);
 
     Pixels single(1, 1, 3, nan);
     mend(only_mean(single), Quantity::normal);
@@ -80,22 +86,29 @@ void the_sky_has_depth_0() {
     render.mean.at(0, 1) = inf;
     render.half_a.at(0, 1) = inf;
     render.half_b.at(0, 1) = 6;
-    CHECK(find_defects(render.buffer(), Quantity::depth, 1).mean.infinite == 2);
+    CHECK_EQUAL(find_defects(render.buffer(), Quantity::depth, 1).mean.infinite, 2);
     mend(render.buffer(), Quantity::depth);
-    CHECK(render.mean.at(0, 0) == 0 && render.half_a.at(0, 0) == 0 && render.half_b.at(0, 0) == 0);
-    CHECK(render.mean.at(0, 1) == 3 && render.half_a.at(0, 1) == 0 && render.half_b.at(0, 1) == 6);
+    CHECK_EQUAL(render.mean.at(0, 0), 0);
+    CHECK_EQUAL(render.half_a.at(0, 0), 0);
+    CHECK_EQUAL(render.half_b.at(0, 0), 0);
+    CHECK_EQUAL(render.mean.at(0, 1), 3);
+    CHECK_EQUAL(render.half_a.at(0, 1), 0);
+    CHECK_EQUAL(render.half_b.at(0, 1), 6);
 
     Pixels mean(1, 2, 1, 4.0F);
     mean.at(0, 0) = inf;
     mend(only_mean(mean), Quantity::depth);
-    CHECK(mean.at(0, 0) == 0 && mean.at(0, 1) == 4);
+    CHECK_EQUAL(mean.at(0, 0), 0);
+    CHECK_EQUAL(mean.at(0, 1), 4);
 
     Pixels beside_nan(1, 1, 1, 1e10F);
     Pixels half_a(1, 1, 1, nan);
     Pixels half_b(1, 1, 1, 1.0F);
     mend({.mean = beside_nan.view(), .half_a = half_a.view(), .half_b = half_b.view(), .variance = {}},
          Quantity::depth);
-    CHECK(beside_nan.at(0, 0) == 1 && half_a.at(0, 0) == 1 && half_b.at(0, 0) == 1);
+    CHECK_EQUAL(beside_nan.at(0, 0), 1);
+    CHECK_EQUAL(half_a.at(0, 0), 1);
+    CHECK_EQUAL(half_b.at(0, 0), 1);
 }
 
 // Where no neighbour is sane either, what one plane knows is not lost.
@@ -105,7 +118,9 @@ void a_sane_plane_stands_for_the_others() {
     Pixels half_b(40, 40, 3, 2.0F);
     mend({.mean = mean.view(), .half_a = half_a.view(), .half_b = half_b.view(), .variance = {}},
          Quantity::color);
-    CHECK(mean.at(20, 20) == 2 && half_a.at(20, 20) == 2 && half_b.at(20, 20) == 2);
+    CHECK_EQUAL(mean.at(20, 20), 2);
+    CHECK_EQUAL(half_a.at(20, 20), 2);
+    CHECK_EQUAL(half_b.at(20, 20), 2);
 
     Pixels known(3, 3, 1, 5.0F);
     Pixels lost_a(3, 3, 1, 4.0F);
@@ -114,11 +129,13 @@ void a_sane_plane_stands_for_the_others() {
     lost_b.at(1, 1) = nan;
     mend({.mean = known.view(), .half_a = lost_a.view(), .half_b = lost_b.view(), .variance = {}},
          Quantity::color);
-    CHECK(known.at(1, 1) == 5 && lost_a.at(1, 1) == 5 && lost_b.at(1, 1) == 5);
+    CHECK_EQUAL(known.at(1, 1), 5);
+    CHECK_EQUAL(lost_a.at(1, 1), 5);
+    CHECK_EQUAL(lost_b.at(1, 1), 5);
 
     Pixels nothing(40, 40, 1, nan);
     mend(only_mean(nothing), Quantity::color);
-    CHECK(nothing.at(20, 20) == 0);
+    CHECK_EQUAL(nothing.at(20, 20), 0);
 }
 
 void lobes_keep_the_light_around_them() {
@@ -126,31 +143,35 @@ void lobes_keep_the_light_around_them() {
     mean.at(0, 1) = -1;
     mean.at(0, 3) = -3;  // as much as no lobe takes from 4 + 4 beside it
     mend(only_mean(mean), Quantity::color);
-    CHECK(mean.at(0, 0) == 3.5F && mean.at(0, 1) == 0 && mean.at(0, 2) == 3.5F);
-    CHECK(mean.at(0, 3) == 0 && mean.at(0, 4) == 4);
+    CHECK_EQUAL(mean.at(0, 0), 3.5F);
+    CHECK_EQUAL(mean.at(0, 1), 0);
+    CHECK_EQUAL(mean.at(0, 2), 3.5F);
+    CHECK_EQUAL(mean.at(0, 3), 0);
+    CHECK_EQUAL(mean.at(0, 4), 4);
 
     Pixels albedo(1, 3, 1, 4.0F);
     albedo.at(0, 1) = -1;
     mend(only_mean(albedo), Quantity::albedo);
-    CHECK(albedo.at(0, 0) == 4 && albedo.at(0, 1) == 0);
+    CHECK_EQUAL(albedo.at(0, 0), 4);
+    CHECK_EQUAL(albedo.at(0, 1), 0);
 
     Pixels alone(1, 1, 1, -1.0F);
     mend(only_mean(alone), Quantity::color);
-    CHECK(alone.at(0, 0) == 0);
+    CHECK_EQUAL(alone.at(0, 0), 0);
 
     Pixels wild(1, 3, 1, inf);
     wild.at(0, 0) = -inf;
     wild.at(0, 1) = -1;
     mend(only_mean(wild), Quantity::color);
-    CHECK(wild.at(0, 1) == 0);
+    CHECK_EQUAL(wild.at(0, 1), 0);
 }
 
 void wild_normals_come_from_the_neighbours() {
     Pixels normal(1, 3, 3, 0.6F);
     normal.at(0, 1) = 1e19F;
-    CHECK(find_defects(only_mean(normal), Quantity::normal, 1).mean.infinite == 1);
+    CHECK_EQUAL(find_defects(only_mean(normal), Quantity::normal, 1).mean.infinite, 1);
     mend(only_mean(normal), Quantity::normal);
-    CHECK(normal.at(0, 1) == 0.6F);
+    CHECK_EQUAL(normal.at(0, 1), 0.6F);
 }
 
 void variance_follows_from_the_halves() {
@@ -161,17 +182,17 @@ void variance_follows_from_the_halves() {
     render.variance.at(0, 0) = nan;
     render.variance.at(2, 2) = -1;
     mend(render.buffer(), Quantity::color);
-    CHECK(render.variance.at(1, 1) == 90000);
-    CHECK(render.variance.at(0, 0) == 22500);
-    CHECK(render.variance.at(2, 2) == 22500);
-    CHECK(render.variance.at(0, 1) == 0);
+    CHECK_EQUAL(render.variance.at(1, 1), 90000);
+    CHECK_EQUAL(render.variance.at(0, 0), 22500);
+    CHECK_EQUAL(render.variance.at(2, 2), 22500);
+    CHECK_EQUAL(render.variance.at(0, 1), 0);
 
     Pixels mean(1, 3, 1, 1.0F);
     Pixels variance(1, 3, 1, 0.5F);
     variance.at(0, 1) = inf;
     variance.at(0, 2) = 0.75F;
     mend({.mean = mean.view(), .half_a = {}, .half_b = {}, .variance = variance.view()}, Quantity::albedo);
-    CHECK(variance.at(0, 1) == 0.75F);
+    CHECK_EQUAL(variance.at(0, 1), 0.75F);
 }
 
 void empty_images_are_fine() {
