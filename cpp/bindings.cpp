@@ -1,5 +1,5 @@
 // The Python module _core: the one file that uses pybind11. Arrays are shared with numpy, never converted;
-// their types and shapes are checked here, all else by the core.
+// that they are such arrays is checked here, all else by the core.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -55,30 +55,22 @@ ConstImage image_from_array(const std::string& name, const py::array& array) {
 
 using OptionalArray = std::optional<py::array>;
 
-// Takes an array, if there is one, that is to have the shape of another.
-ConstImage image_in_shape_of(const py::array& other, const std::string& name, const OptionalArray& array) {
-    if (!array) return {};
-    const ConstImage image = image_from_array(name, *array);
-    if (!array->attr("shape").equal(other.attr("shape"))) {
-        throw py::value_error(name + ": expected the shape of the others, " +
-                              std::string(py::str(other.attr("shape"))) + ", got " +
-                              std::string(py::str(array->attr("shape"))));
-    }
-    return image;
+ConstImage image_from_array(const std::string& name, const OptionalArray& array) {
+    return array ? image_from_array(name, *array) : ConstImage{};
 }
 
 ConstBuffer buffer_from_arrays(const py::array& mean, const OptionalArray& half_a,
                                const OptionalArray& half_b, const OptionalArray& variance) {
     return {.mean = image_from_array("mean", mean),
-            .half_a = image_in_shape_of(mean, "half_a", half_a),
-            .half_b = image_in_shape_of(mean, "half_b", half_b),
-            .variance = image_in_shape_of(mean, "variance", variance)};
+            .half_a = image_from_array("half_a", half_a),
+            .half_b = image_from_array("half_b", half_b),
+            .variance = image_from_array("variance", variance)};
 }
 
 Image view_of(Array& out) { return view_of(out.mutable_data(), out); }
 Array array_like(ConstImage image) { return Array({image.height, image.width, image.channels}); }
 
-// Returns the planes, those with defects as mended copies, and the defects of each.
+// Returns the images, those with defects as mended copies, and the defects of each.
 py::tuple sanitize(const std::string& quantity_name, const py::array& mean, const OptionalArray& half_a,
                    const OptionalArray& half_b, const OptionalArray& variance, int threads) {
     const std::optional<Quantity> quantity = quantity_from_name(quantity_name);
@@ -95,12 +87,12 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
     Buffer mended;
     const auto copied_if_defective = [](const OptionalArray& array, const Defects& found, Image& view) {
         if (!array) return py::object(py::none());
-        const py::array plane = found.any() ? py::array(array->attr("copy")()) : *array;
-        // `mend` writes to no plane without defects.
-        view = view_of(static_cast<float*>(const_cast<void*>(plane.data())), plane);
-        return py::object(plane);
+        const py::array image = found.any() ? py::array(array->attr("copy")()) : *array;
+        // `mend` writes to no image without defects.
+        view = view_of(static_cast<float*>(const_cast<void*>(image.data())), image);
+        return py::object(image);
     };
-    const py::tuple planes = py::make_tuple(copied_if_defective(mean, defects.mean, mended.mean),
+    const py::tuple images = py::make_tuple(copied_if_defective(mean, defects.mean, mended.mean),
                                             copied_if_defective(half_a, defects.half_a, mended.half_a),
                                             copied_if_defective(half_b, defects.half_b, mended.half_b),
                                             copied_if_defective(variance, defects.variance, mended.variance));
@@ -108,15 +100,15 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
         const py::gil_scoped_release release;
         mend(mended, *quantity);
     }
-    return py::make_tuple(planes,
+    return py::make_tuple(images,
                           py::make_tuple(defects.mean, defects.half_a, defects.half_b, defects.variance));
 }
 
 HalvesTest compare_halves_arrays(const py::array& half_a, const py::array& half_b,
                                  const OptionalArray& variance, int threads) {
     const ConstImage image_a = image_from_array("half_a", half_a);
-    const ConstImage image_b = image_in_shape_of(half_a, "half_b", half_b);
-    const ConstImage variance_image = image_in_shape_of(half_a, "variance", variance);
+    const ConstImage image_b = image_from_array("half_b", half_b);
+    const ConstImage variance_image = image_from_array("variance", variance);
     const py::gil_scoped_release release;
     return compare_halves(image_a, image_b, variance_image, threads);
 }
@@ -125,17 +117,17 @@ py::tuple prefilter_feature_arrays(const py::array& mean, const py::array& half_
                                    const OptionalArray& variance, int radius, int step, float k,
                                    int threads) {
     const ConstBuffer in = buffer_from_arrays(mean, half_a, half_b, variance);
-    std::array<Array, 4> planes{array_like(in.mean), array_like(in.mean), array_like(in.mean),
+    std::array<Array, 4> images{array_like(in.mean), array_like(in.mean), array_like(in.mean),
                                 array_like(in.mean)};
-    const Buffer out{.mean = view_of(planes[0]),
-                     .half_a = view_of(planes[1]),
-                     .half_b = view_of(planes[2]),
-                     .variance = view_of(planes[3])};
+    const Buffer out{.mean = view_of(images[0]),
+                     .half_a = view_of(images[1]),
+                     .half_b = view_of(images[2]),
+                     .variance = view_of(images[3])};
     {
         const py::gil_scoped_release release;
-        prefilter_feature(in, out, {.radius = radius, .step = step, .k = k}, threads);
+        prefilter_feature(in, out, {.radius = radius, .step = step}, k, threads);
     }
-    return py::make_tuple(planes[0], planes[1], planes[2], planes[3]);
+    return py::make_tuple(images[0], images[1], images[2], images[3]);
 }
 
 Array box_mean_array(const py::array& in, int radius, int threads) {
@@ -152,27 +144,19 @@ Array regress_arrays(const py::array& target, const py::array& features, const s
                      float k, int threads) {
     const ConstImage target_image = image_from_array("target", target);
     const ConstImage feature_image = image_from_array("features", features);
-    ConstImage guide_image;
-    ConstImage guide_variance_image;
-    if (guide && guide_variance) {
-        guide_image = image_from_array("guide", *guide);
-        guide_variance_image = image_from_array("guide_variance", *guide_variance);
-        if (guide_image.channels != guide_variance_image.channels) {
-            throw py::value_error("guide_variance: expected as many channels as the guide has");
-        }
-    } else if (guide || guide_variance) {
-        throw py::value_error("guide and guide_variance: expected both or neither");
-    }
-    for (const ConstImage& image : {feature_image, guide_image, guide_variance_image}) {
-        if (image.known() && (image.height != target_image.height || image.width != target_image.width)) {
-            throw py::value_error("expected all images in the size of the target");
-        }
+    if (guide.has_value() != guide_variance.has_value())
+        throw py::value_error("guide and guide_variance: expected both or neither, got one");
+    std::optional<Guide> guide_images;
+    if (guide) {
+        guide_images = Guide{.image = image_from_array("guide", *guide),
+                             .variance = image_from_array("guide_variance", *guide_variance),
+                             .k = k};
     }
     Array out = array_like(target_image);
     const Image out_image = view_of(out);
     const py::gil_scoped_release release;
-    regress(target_image, feature_image, penalty, guide_image, guide_variance_image,
-            {.radius = radius, .step = step, .k = k}, out_image, threads);
+    regress(target_image, feature_image, penalty, guide_images, {.radius = radius, .step = step}, out_image,
+            threads);
     return out;
 }
 
@@ -189,9 +173,6 @@ Array smooth_along_edges_array(const py::array& image, const py::array& tensor, 
                                int threads) {
     const ConstImage in = image_from_array("image", image);
     const ConstImage tensor_image = image_from_array("tensor", tensor);
-    if (tensor_image.height != in.height || tensor_image.width != in.width || tensor_image.channels != 3) {
-        throw py::value_error("expected a structure tensor in the size of the image, with 3 channels");
-    }
     Array out = array_like(in);
     const Image out_image = view_of(out);
     const py::gil_scoped_release release;
@@ -206,7 +187,11 @@ NormAct norm_from_arrays(const Numbers& x, const Array& weight, const Array& bia
                          float slope) {
     if (x.ndim() != 2 || x.shape(1) == 0 || x.shape(0) == 0 || weight.size() != x.shape(1) ||
         bias.size() != x.shape(1)) {
-        throw py::value_error("expected pixels of some channels, and as many weights and biases");
+        throw py::value_error(
+            "x, weight, bias: expected shape (pixels, channels) without a 0, and a weight and a bias for "
+            "each "
+            "channel, got " +
+            described(x) + ", " + described(weight) + ", " + described(bias));
     }
     return {.pixels = static_cast<std::size_t>(x.shape(0)),
             .channels = static_cast<std::size_t>(x.shape(1)),
@@ -241,7 +226,9 @@ py::tuple norm_act_gradient_arrays(const Numbers& gradient, const Numbers& x, co
     if (!in_shape_of_x(y) || !in_shape_of_x(gradient) || mean.size() != x.shape(1) ||
         scale.size() != x.shape(1)) {
         throw py::value_error(
-            "expected outputs and gradients in the shape of x, and moments of its channels");
+            "gradient, y, mean, scale: expected two images in the shape of x and two values for each of its "
+            "channels, got " +
+            described(gradient) + ", " + described(y) + ", " + described(mean) + ", " + described(scale));
     }
     Numbers by_x({x.shape(0), x.shape(1)});
     Array by_weight(x.shape(1));

@@ -1,10 +1,10 @@
 // The mean over a square window, in a time that hardly grows with it.
 #include <algorithm>
 #include <cstddef>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 #include "fastest.hpp"
 
@@ -74,7 +74,8 @@ class WindowMeans {
 }  // namespace
 
 void box_mean(ConstImage in, int radius, Image out, int threads) {
-    if (radius < 0) throw std::invalid_argument("the radius must not be negative");
+    if (radius < 0) refuse("radius", "0 or more", radius);
+    check_same_shape("out", out, "image", in);
     if (in.size() == 0) return;
     std::vector<float> pixels(static_cast<std::size_t>(in.size()));
     const Image across{

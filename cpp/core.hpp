@@ -2,7 +2,8 @@
 // filters of features and pilots, and a layer of the published networks. Free of Python and of any renderer.
 //
 // Images are float32, C-contiguous, shape (height, width, channels), row 0 at the top; colour is linear
-// radiance. `threads` is how many threads work, 1 at least; no result depends on it, to the bit.
+// radiance. `threads` is how many threads work, 1 at least; no result depends on it, to the bit. An argument
+// that does not fit raises std::invalid_argument, which says what was expected and what came.
 #pragma once
 
 #include <algorithm>
@@ -110,6 +111,7 @@ struct BufferDefects {
     [[nodiscard]] bool any() const { return mean.any() || half_a.any() || half_b.any() || variance.any(); }
 };
 
+// Images that are not known have none.
 [[nodiscard]] BufferDefects find_defects(const ConstBuffer& buffer, Quantity quantity, int threads);
 
 // Replaces every defect in place; images without defects are not written to.
@@ -136,6 +138,7 @@ struct HalvesTest {
     double correlation = std::numeric_limits<double>::quiet_NaN();
     bool independent = false;  // false as well where the correlation is NaN
 };
+// `variance` is that of the mean, by the samples; it may be unknown.
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);
 
@@ -144,43 +147,48 @@ struct HalvesTest {
 // The mean over a square window of (2 radius + 1)^2 pixels, clipped at the borders of the image.
 void box_mean(ConstImage in, int radius, Image out, int threads);
 
-// --- search_window.cpp
+// --- The windows of filters
 
 // How far filters may look, in pixels: further than any needs to, and images with so wide a border repeated
 // around them still fit into memory.
 constexpr int max_radius = 256;
 
-// Where a filter looks for pixels that are alike, in every `step`-th row and column up to `radius` away, a
-// multiple of it, and how many standard deviations of their noise apart those may be.
+// Where a filter looks for pixels that are alike: in every `step`-th row and column up to `radius` away,
+// which is a multiple of the step.
 struct SearchWindow {
     int radius;
     int step;
-    float k;
-
-    // Throws std::invalid_argument unless it can be searched.
-    void check() const;
 };
 
 // --- prefilter.cpp
 
 // Cross-filters the halves of a feature by non-local means, each with the weights of the other (Bitterli et
 // al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", section 5.1).
-// `in` must have halves; `out` needs all four images and overlaps nothing. Its variance is what noise remains
-// after filtering. A value is passed through unchanged where its pixel and those next to it have hardly
-// any noise: their halves differ, and their standard deviations are, by less than a thousandth of it.
-void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, int threads);
+// Values are alike that are `k` standard deviations of their noise apart. `in` must have halves; `out` needs
+// all four images and overlaps nothing; its variance is that of the noise which remains. A value is passed
+// through unchanged where its pixel and those next to it have hardly any noise: their halves differ, and
+// their standard deviations are, by less than a thousandth of it.
+void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, float k, int threads);
 
 // --- regression.cpp
+
+// What tells which neighbours are alike: an image, the variance of its values (same shape), and how many
+// standard deviations of their noise apart values may be.
+struct Guide {
+    ConstImage image;
+    ConstImage variance;
+    float k;
+};
 
 // Denoises `target` by first-order regression on `features`, fitted anew around every pixel; all predictions
 // that a pixel gets from its neighbours' fits are averaged (Bitterli et al. 2016, section 4; Moon et al.
 // 2014); with a window's step above 1, those in every (step + 1)-th row and column. A neighbour's weight is
-// the non-local means weight of `guide` and its per-pixel `guide_variance` (same shape; without channels
-// every neighbour counts the same), times exp(-sum penalty_c (feature_c(p) - feature_c(q))^2). `penalty` has
-// one value per feature. At most 16 features; everything must be finite. Sums are float32: features should
-// differ by no more than some tens within a window; where they differ by some hundreds, results are useless.
-void regress(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
-             ConstImage guide_variance, SearchWindow window, Image out, int threads);
+// the non-local means weight of the guide (1 without one), times exp(-sum penalty_c (feature_c(p) -
+// feature_c(q))^2). `penalty` has one value per feature. At most 16 features; everything must be finite. Sums
+// are float32: features should differ by no more than some tens within a window; where they differ by some
+// hundreds, results are useless.
+void regress(ConstImage target, ConstImage features, std::span<const float> penalty,
+             const std::optional<Guide>& guide, SearchWindow window, Image out, int threads);
 
 // --- steering.cpp
 

@@ -3,20 +3,16 @@
 #include <atomic>
 #include <exception>
 #include <mutex>
-#include <stdexcept>
-#include <string>
 #include <thread>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 
 namespace tungsten_dip {
 
 void parallel_for(int count, int threads, const std::function<void(int)>& body) {
-    if (threads < 1) {
-        throw std::invalid_argument("threads: expected a whole number from 1 on, got " +
-                                    std::to_string(threads));
-    }
+    if (threads < 1) refuse("threads", "a whole number from 1 on", threads);
     threads = std::min(threads, count);
 
     std::atomic<int> next = 0;

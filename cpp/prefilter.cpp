@@ -6,11 +6,15 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
+#include <stdexcept>
+#include <utility>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 #include "exp_minus.hpp"
 #include "fastest.hpp"
+#include "non_local_means.hpp"
 #include "padded_planes.hpp"
 
 namespace tungsten_dip {
@@ -20,9 +24,9 @@ namespace {
 constexpr int patch_radius = 3;
 constexpr std::size_t patch_size = 2 * std::size_t{patch_radius} + 1;
 
-// Keeps distances finite where there is no variance: there, values that differ by less than 1e-4 or so are
-// equal.
-constexpr float epsilon = 1e-7F;
+// The floor of squared differences' unit: where there is no variance, values that differ by less than 1e-4 or
+// so are equal.
+constexpr float least_unit = 1e-7F;
 // From here on a weight is 0 whatever the rest of the patch says; keeps the sums far from overflow.
 constexpr float largest_distance = 1e4F;
 
@@ -125,14 +129,16 @@ class NoisyPixels {
 // repeated outwards.
 class TileFilter {
   public:
-    TileFilter(const Feature& feature, SearchWindow window, Rectangle tile)
+    TileFilter(const Feature& feature, float k, Rectangle tile)
         : feature_(feature),
-          k_squared_(window.k * window.k),
+          k_squared_(k * k),
           rows_(tile.rows),
           columns_(tile.columns),
           sums_(static_cast<std::size_t>(feature.a.channels() * tile_size)),
           weights_(tile_size),
-          patch_rows_(padded_size) {
+          patch_rows_(padded_size) {}
+
+    void run(SearchWindow window) {
         for (int dy = -window.radius; dy <= window.radius; dy += window.step) {
             for (int dx = -window.radius; dx <= window.radius; dx += window.step) add_offset(dy, dx);
         }
@@ -180,9 +186,7 @@ class TileFilter {
         for (int y = first; y < end; ++y) add_row(y, dy, dx);
     }
 
-    // The distances of a row's pixels to their partners, after Rousselle et al. 2012: squared differences
-    // less what noise alone makes of them, over the variance, averaged over channels, then summed over the
-    // columns of patches.
+    // The distances of a row's pixels to their partners, summed over the columns of patches.
     TUNGSTEN_DIP_FASTEST void measure_row(int y, int dy, int dx, HalvesRow<tile_size>& out) const {
         HalvesRow<padded_size> distances;  // NOLINT(*-member-init): the first channel sets them
         const auto padded_count =
@@ -197,8 +201,9 @@ class TileFilter {
             const float* b_there = feature_.b.row(c, y + dy) + x + dx;
             const float* variance_there = feature_.variance.row(c, y + dy) + x + dx;
             for (std::size_t i = 0; i < padded_count; ++i) {
-                const float noise = variance[i] + std::min(variance[i], variance_there[i]);
-                const float scale = share / (k_squared_ * (variance[i] + variance_there[i]) + epsilon);
+                const float noise = expected_squared_difference(variance[i], variance_there[i]);
+                const float scale = share / unit_of_squared_difference(variance[i], variance_there[i],
+                                                                       k_squared_, least_unit);
                 const float difference_a = a[i] - a_there[i];
                 const float difference_b = b[i] - b_there[i];
                 const float sum_a = c == 0 ? 0 : distances.a[i];
@@ -237,14 +242,8 @@ class TileFilter {
             weight.a[i] = exp_minus(std::max(scale * sum_a, 0.0F));
             weight.b[i] = exp_minus(std::max(scale * sum_b, 0.0F));
         }
-        // Partners outside of the image do not count.
-        const int width = feature_.a.width();
-        const int before = std::clamp(-dx - columns_.begin, 0, columns_.size());
-        const int inside = std::clamp(width - dx - columns_.begin, before, columns_.size());
-        for (float* weights : {weight.a.data(), weight.b.data()}) {
-            std::fill_n(weights, before, 0.0F);
-            std::fill(weights + inside, weights + size, 0.0F);
-        }
+        for (float* weights : {weight.a.data(), weight.b.data()})
+            drop_outside_partners(columns_.begin, dx, feature_.a.width(), columns_.size(), weights);
 
         auto& total = weights_[tile_row(y)];
         for (std::size_t i = 0; i < size; ++i) {
@@ -283,9 +282,17 @@ void estimate_variance_of_half(const ConstBuffer& in, Image out, int threads) {
 
 }  // namespace
 
-void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, int threads) {
-    window.check();
+void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow window, float k, int threads) {
+    check_window(window);
+    check_k(k);
+    check_buffer(in);
+    for (const auto& [name, image] :
+         {std::pair{"out.mean", out.mean}, std::pair{"out.half_a", out.half_a},
+          std::pair{"out.half_b", out.half_b}, std::pair{"out.variance", out.variance}}) {
+        check_same_shape(name, image, "mean", in.mean);
+    }
     if (in.mean.size() == 0) return;
+    if (!in.has_halves()) throw std::invalid_argument("half_a and half_b: expected both, got one or none");
     estimate_variance_of_half(in, out.variance, threads);
     const int margin = window.radius + patch_radius;
     const Feature feature{.a = {in.half_a, margin, threads},
@@ -303,7 +310,10 @@ void prefilter_feature(const ConstBuffer& in, const Buffer& out, SearchWindow wi
         const Rectangle part =
             noisy.within({.rows = {.begin = top, .end = std::min(top + tile_size, in.mean.height)},
                           .columns = {.begin = left, .end = std::min(left + tile_size, in.mean.width)}});
-        if (!part.empty()) TileFilter(feature, window, part).write(noisy, out.half_a, out.half_b);
+        if (part.empty()) return;
+        TileFilter filter(feature, k, part);
+        filter.run(window);
+        filter.write(noisy, out.half_a, out.half_b);
     });
 
     halves_variance(out.half_a, out.half_b, out.mean, threads);

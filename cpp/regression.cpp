@@ -1,8 +1,8 @@
 // Local first-order regression: the pilots from which the fit composes its image.
 //
-// Both of its sums, those of the normal equations and those of the predictions, are weighted sums of planes
+// Both of its sums, those of the normal equations and those of the predictions, are weighted sums of terms
 // that depend on the neighbour alone: products of its features and colour, or the coefficients of its fit. A
-// tile computes the planes once, and the weights of a row of neighbours together, so that a sum stays in a
+// tile computes the terms once, and the weights of a row of neighbours together, so that a sum stays in a
 // register while it runs over that row. Features are counted from an origin within the tile: sums of squares
 // of large values would lose the small differences.
 #include <algorithm>
@@ -13,12 +13,14 @@
 #include <iterator>
 #include <optional>
 #include <span>
-#include <stdexcept>
+#include <string>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 #include "exp_minus.hpp"
 #include "fastest.hpp"
+#include "non_local_means.hpp"
 #include "padded_planes.hpp"
 
 namespace tungsten_dip {
@@ -29,8 +31,10 @@ constexpr int tile_height = 8;
 constexpr int colors = 3;
 constexpr int max_features = 16;
 
-// Distances of the guide below this are equal whatever its variance says.
-constexpr float least_variance = 1e-8F;
+// The floor of squared differences' unit: where a guide has no variance, values that differ by less than 3e-5
+// or so are equal.
+constexpr float least_unit = 1e-8F;
+// A pixel's own weight alone is more; beyond the image, where lanes compute in vain, sums may be 0.
 constexpr float least_weight_sum = 1e-20F;
 
 // The guide is compared in patches of this radius.
@@ -51,28 +55,28 @@ struct Tile {
 using FeatureRows = std::array<const float*, max_features>;
 using FeatureValues = std::array<float, max_features>;
 
-constexpr int planes_at_once = 8;
+constexpr int terms_at_once = 8;
 using Lanes [[gnu::vector_size(lanes * sizeof(float))]] = float;
 using LanesInMemory [[gnu::aligned(alignof(float)), gnu::may_alias]] = Lanes;
 
-// distances = the noise-corrected squared differences of one row of the guide from another, in units of its
-// noise (Rousselle et al. 2012, equation 2), averaged over channels.
+// distances = those of one row of the guide from another, averaged over channels, whose planes lie
+// `plane_size` apart.
 TUNGSTEN_DIP_FASTEST void compare_rows(const float* p, const float* q, const float* variance_p,
-                                       const float* variance_q, std::ptrdiff_t plane, int channels,
+                                       const float* variance_q, std::ptrdiff_t plane_size, int channels,
                                        float k_squared, int count, float* distances) {
     std::fill_n(distances, count, 0.0F);
     const float scale = 1.0F / static_cast<float>(channels);
     for (int c = 0; c < channels; ++c) {
         for (int x = 0; x < count; ++x) {
             const float difference = p[x] - q[x];
-            const float noise = variance_p[x] + std::min(variance_p[x], variance_q[x]);
+            const float noise = expected_squared_difference(variance_p[x], variance_q[x]);
             distances[x] += scale * (difference * difference - noise) /
-                            (least_variance + k_squared * (variance_p[x] + variance_q[x]));
+                            unit_of_squared_difference(variance_p[x], variance_q[x], k_squared, least_unit);
         }
-        p += plane;
-        q += plane;
-        variance_p += plane;
-        variance_q += plane;
+        p += plane_size;
+        q += plane_size;
+        variance_p += plane_size;
+        variance_q += plane_size;
     }
 }
 
@@ -104,78 +108,78 @@ TUNGSTEN_DIP_FASTEST void weigh_row(const PaddedPlanes& features, int y, int x, 
     for (int i = 0; i < count; ++i) weights[i] = share * exp_minus(std::max(weights[i], 0.0F));
 }
 
-// What a row of neighbours adds to the normal equations: planes of 1, f, f f' (upper triangle), and per
-// colour of y and y f.
+// The terms that a row of neighbours adds to the normal equations: 1, f, f f' (upper triangle), and per
+// colour y and y f. Each is a row, `stride` after the one before.
 TUNGSTEN_DIP_FASTEST void carry_products(const FeatureRows& features, const FeatureValues& origin, int n,
                                          const std::array<const float*, colors>& target, int count,
-                                         int stride, float* planes) {
-    std::fill_n(planes, count, 1.0F);
-    const float* const centred = planes += stride;
-    for (int f = 0; f < n; ++f, planes += stride) {
+                                         int stride, float* terms) {
+    std::fill_n(terms, count, 1.0F);
+    const float* const centred = terms += stride;
+    for (int f = 0; f < n; ++f, terms += stride) {
         const auto i = static_cast<std::size_t>(f);
-        for (int x = 0; x < count; ++x) planes[x] = features[i][x] - origin[i];
+        for (int x = 0; x < count; ++x) terms[x] = features[i][x] - origin[i];
     }
     for (int f = 0; f < n; ++f) {
         const float* a = centred + static_cast<std::ptrdiff_t>(f) * stride;
-        for (int g = f; g < n; ++g, planes += stride) {
+        for (int g = f; g < n; ++g, terms += stride) {
             const float* b = centred + static_cast<std::ptrdiff_t>(g) * stride;
-            for (int x = 0; x < count; ++x) planes[x] = a[x] * b[x];
+            for (int x = 0; x < count; ++x) terms[x] = a[x] * b[x];
         }
     }
     for (const float* y : target) {
-        std::copy_n(y, count, planes);
-        planes += stride;
-        for (int f = 0; f < n; ++f, planes += stride) {
+        std::copy_n(y, count, terms);
+        terms += stride;
+        for (int f = 0; f < n; ++f, terms += stride) {
             const float* a = centred + static_cast<std::ptrdiff_t>(f) * stride;
-            for (int x = 0; x < count; ++x) planes[x] = y[x] * a[x];
+            for (int x = 0; x < count; ++x) terms[x] = y[x] * a[x];
         }
     }
 }
 
-// What a row of neighbours adds to the predictions: per colour planes of what its fit says at the origin and
-// of its slopes, and one of 1.
+// The terms that a row of neighbours adds to the predictions: per colour what its fit says at the origin and
+// its slopes, and 1. Each is a row, `stride` after the one before.
 TUNGSTEN_DIP_FASTEST void carry_coefficients(const FeatureRows& features, const FeatureValues& origin, int n,
                                              const float* const* coefficients, int count, int stride,
-                                             float* planes) {
+                                             float* terms) {
     for (int c = 0; c < colors; ++c) {
-        float* constant = planes;
+        float* constant = terms;
         std::copy_n(*coefficients++, count, constant);
-        planes += stride;
-        for (int f = 0; f < n; ++f, planes += stride) {
+        terms += stride;
+        for (int f = 0; f < n; ++f, terms += stride) {
             const auto i = static_cast<std::size_t>(f);
-            std::copy_n(*coefficients++, count, planes);
-            for (int x = 0; x < count; ++x) constant[x] -= planes[x] * (features[i][x] - origin[i]);
+            std::copy_n(*coefficients++, count, terms);
+            for (int x = 0; x < count; ++x) constant[x] -= terms[x] * (features[i][x] - origin[i]);
         }
     }
-    std::fill_n(planes, count, 1.0F);
+    std::fill_n(terms, count, 1.0F);
 }
 
-// Adds to a row of every sum the row of the same plane, weighted, at `offset_count` neighbours in a row,
-// `step` pixels apart.
-TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, int offset_count, int step, const float* planes,
-                                       std::ptrdiff_t stride, int plane_count, int count, float* sums) {
-    for (int first = 0; first < plane_count; first += planes_at_once, planes += planes_at_once * stride) {
+// Adds to a row of every sum the row of its term, weighted, at `offset_count` neighbours in a row, `step`
+// pixels apart.
+TUNGSTEN_DIP_FASTEST void add_weighted(const float* weights, int offset_count, int step, const float* terms,
+                                       std::ptrdiff_t stride, int term_count, int count, float* sums) {
+    for (int first = 0; first < term_count; first += terms_at_once, terms += terms_at_once * stride) {
         for (int x = 0; x < count; x += lanes) {
-            std::array<Lanes, planes_at_once> sum_of_plane{};
+            std::array<Lanes, terms_at_once> sum_of_term{};
             const float* weight = weights + x;
-            const float* neighbour = planes + x;
+            const float* neighbour = terms + x;
             for (int k = 0; k < offset_count; ++k, weight += tile_width, neighbour += step) {
                 const float* value = neighbour;
-#pragma GCC unroll planes_at_once
-                for (Lanes& sum : sum_of_plane) {
+#pragma GCC unroll terms_at_once
+                for (Lanes& sum : sum_of_term) {
                     sum += reinterpret_cast<const LanesInMemory&>(*weight) *
                            reinterpret_cast<const LanesInMemory&>(*value);
                     value += stride;
                 }
             }
             float* to = sums + x;
-#pragma GCC unroll planes_at_once
-            for (const Lanes& sum : sum_of_plane) {
+#pragma GCC unroll terms_at_once
+            for (const Lanes& sum : sum_of_term) {
                 reinterpret_cast<LanesInMemory&>(*to) += sum;
                 to += tile_width;
             }
         }
-        sums += std::ptrdiff_t{planes_at_once} * tile_width;
+        sums += std::ptrdiff_t{terms_at_once} * tile_width;
     }
 }
 
@@ -207,12 +211,12 @@ TUNGSTEN_DIP_FASTEST void solve(std::size_t n, Equations& a) {
     }
 }
 
-// Fits `count` pixels, `systems` at most, from their sums of the planes of `carry_products`, which lie
-// tile_width apart. Writes, in planes, what the fit says at the pixel itself and its slopes, for every
-// colour.
+// Fits `count` pixels, `systems` at most, from their sums of the terms of `carry_products`, which lie
+// tile_width apart. Writes, in planes that lie `plane_size` apart, what the fit says at the pixel itself and
+// its slopes, for every colour.
 TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& features,
                                      const FeatureValues& origin, std::size_t n, int count,
-                                     float* coefficients, std::ptrdiff_t plane) {
+                                     float* coefficients, std::ptrdiff_t plane_size) {
     Equations a;                             // NOLINT(*-member-init): filled below
     std::array<Systems, max_features> mean;  // NOLINT(*-member-init)
     Systems scale;                           // NOLINT(*-member-init)
@@ -241,7 +245,7 @@ TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& featu
     solve(n, a);
     const auto write = [&](const Systems& values) {
         for (int s = 0; s < count; ++s) coefficients[s] = static_cast<float>(values[s]);
-        coefficients += plane;
+        coefficients += plane_size;
     };
     for (std::size_t f = 0; f < n; ++f) {
         for (int s = 0; s < systems; ++s) mean[f][s] -= static_cast<double>(features[f][s] - origin[f]);
@@ -253,7 +257,7 @@ TUNGSTEN_DIP_FASTEST void fit_pixels(const float* sums, const FeatureRows& featu
     }
 }
 
-// colors[c] = (constant_c + slope_c . (f - origin)) / weight, from the sums of the planes of
+// colors[c] = (constant_c + slope_c . (f - origin)) / weight, from the sums of the terms of
 // `carry_coefficients`, which lie tile_width apart.
 TUNGSTEN_DIP_FASTEST void predict_row(const float* sums, const FeatureRows& features,
                                       const FeatureValues& origin, int n, int count, float* predictions) {
@@ -271,17 +275,19 @@ TUNGSTEN_DIP_FASTEST void predict_row(const float* sums, const FeatureRows& feat
 
 class Regression {
   public:
-    Regression(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
-               ConstImage guide_variance, SearchWindow window, int threads)
+    Regression(ConstImage target, ConstImage features, std::span<const float> penalty,
+               const std::optional<Guide>& guide, SearchWindow window, int threads)
         : window_(window),
           threads_(threads),
           target_(target, window.radius, threads),
           features_(features, window.radius, threads),
           coefficients_(colors * (features.channels + 1), target.height, target.width, window.radius) {
         std::ranges::copy(penalty, penalty_.begin());
-        if (guide.channels > 0) {
+        if (guide) {
             const int margin = window.radius + patch_radius;
-            guide_ = Guide{.image = {guide, margin, threads}, .variance = {guide_variance, margin, threads}};
+            guide_ = PaddedGuide{.image = {guide->image, margin, threads},
+                                 .variance = {guide->variance, margin, threads},
+                                 .k_squared = guide->k * guide->k};
         }
     }
 
@@ -291,15 +297,16 @@ class Regression {
     }
 
   private:
-    struct Guide {
+    struct PaddedGuide {
         PaddedPlanes image;
         PaddedPlanes variance;
+        float k_squared;
     };
 
     struct Scratch {
-        std::vector<float> planes;     // [row][plane][column], of the tile and the windows of its pixels
+        std::vector<float> terms;      // [row][term][column], of the tile and the windows of its pixels
         std::vector<float> weights;    // [row of the tile][offset in a row][column]
-        std::vector<float> sums;       // [row of the tile][plane][column]
+        std::vector<float> sums;       // [row of the tile][term][column]
         std::vector<float> distances;  // [row][column], of the tile and its patches
 
         [[nodiscard]] float* sums_of_row(int i) {
@@ -329,26 +336,26 @@ class Regression {
     // image would fall apart into grids that know nothing of each other.
     [[nodiscard]] int gather_step() const { return window_.step == 1 ? 1 : window_.step + 1; }
 
-    // Leaves in scratch.sums, for every pixel of the tile, the weighted sums of `plane_count` planes over
+    // Leaves in scratch.sums, for every pixel of the tile, the weighted sums of `term_count` terms over
     // every step-th row and column of its window, the pixel itself among them. `carry(y, x, count, stride,
-    // planes)` writes the planes of the neighbours in row y from column x on.
+    // terms)` writes the terms of the neighbours in row y from column x on.
     template <typename Carry>
-    void sum_windows(const Tile& tile, int step, int plane_count, Scratch& scratch,
-                     const Carry& carry) const {
+    void sum_windows(const Tile& tile, int step, int term_count, Scratch& scratch, const Carry& carry) const {
         const int reach = window_.radius / step * step;
         const int offset_count = 2 * reach / step + 1;
-        const int planes = rounded_up(plane_count, planes_at_once);
+        const int padded_count = rounded_up(term_count, terms_at_once);
         const int stride = tile_width + 2 * reach;
         const int first_row = std::max(tile.y - reach, 0);
         const int end_row = std::min(tile.y + tile.height + reach, target_.height());
-        const std::ptrdiff_t size_of_row = std::ptrdiff_t{planes} * stride;
+        const std::ptrdiff_t size_of_row = std::ptrdiff_t{padded_count} * stride;
         const std::ptrdiff_t weights_of_row = std::ptrdiff_t{offset_count} * tile_width;
-        scratch.planes.resize(static_cast<std::size_t>((end_row - first_row) * size_of_row));
+        scratch.terms.resize(static_cast<std::size_t>((end_row - first_row) * size_of_row));
         scratch.weights.resize(static_cast<std::size_t>(tile_height * weights_of_row));
-        scratch.sums.assign(std::size_t{tile_height} * static_cast<std::size_t>(planes) * tile_width, 0);
+        scratch.sums.assign(std::size_t{tile_height} * static_cast<std::size_t>(padded_count) * tile_width,
+                            0);
         for (int y = first_row; y < end_row; ++y) {
             carry(y, tile.x - reach, tile.width + 2 * reach, stride,
-                  scratch.planes.data() + (y - first_row) * size_of_row);
+                  scratch.terms.data() + (y - first_row) * size_of_row);
         }
         for (int dy = -reach; dy <= reach; dy += step) {
             const int first = std::max(tile.y, -dy);
@@ -361,7 +368,7 @@ class Regression {
             }
             for (int y = first; y < end; ++y) {
                 add_weighted(scratch.weights.data() + (y - tile.y) * weights_of_row, offset_count, step,
-                             scratch.planes.data() + (y + dy - first_row) * size_of_row, stride, planes,
+                             scratch.terms.data() + (y + dy - first_row) * size_of_row, stride, padded_count,
                              rounded_up(tile.width, lanes), scratch.sums_of_row(y - tile.y));
             }
         }
@@ -383,16 +390,13 @@ class Regression {
             if (y + dy < 0 || y + dy >= target_.height()) continue;
             if (!guide_) std::fill_n(weights, tile_width, 0.0F);
             weigh_row(features_, y, tile.x, dy, dx, penalty_, share, rounded_up(tile.width, lanes), weights);
-            const int first = std::clamp(-dx - tile.x, 0, tile.width);
-            const int last = std::clamp(target_.width() - dx - tile.x, 0, tile.width);
-            std::fill(weights, weights + first, 0.0F);
-            std::fill(weights + last, weights + tile.width, 0.0F);
+            drop_outside_partners(tile.x, dx, target_.width(), tile.width, weights);
         }
     }
 
     // The guide's distances at one offset, averaged over patches.
-    void compare_guide(const Guide& guide, const Tile& tile, int dy, int dx, Scratch& scratch,
-                       float* distances, std::ptrdiff_t distances_of_row) const {
+    static void compare_guide(const PaddedGuide& guide, const Tile& tile, int dy, int dx, Scratch& scratch,
+                              float* distances, std::ptrdiff_t distances_of_row) {
         const int rows = tile.height + 2 * patch_radius;
         const int columns = rounded_up(tile.width + 2 * patch_radius, lanes);
         scratch.distances.resize(static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns));
@@ -402,8 +406,7 @@ class Regression {
             const std::ptrdiff_t q = p + dx;
             compare_rows(guide.image.row(0, y) + p, guide.image.row(0, y + dy) + q,
                          guide.variance.row(0, y) + p, guide.variance.row(0, y + dy) + q,
-                         guide.image.plane_size(), guide.image.channels(), window_.k * window_.k, columns,
-                         row);
+                         guide.image.plane_size(), guide.image.channels(), guide.k_squared, columns, row);
         }
         for (int i = 0; i < tile.height; ++i) {
             average_patches(scratch.distances.data() + static_cast<std::ptrdiff_t>(i) * columns, columns,
@@ -432,10 +435,10 @@ class Regression {
         const int n = features_.channels();
         const FeatureValues origin = origin_of(tile);
         sum_windows(tile, window_.step, (n + 1) * (n + 2) / 2 + colors * (n + 1), scratch,
-                    [&](int y, int x, int count, int stride, float* planes) {
+                    [&](int y, int x, int count, int stride, float* terms) {
                         carry_products(feature_rows(y, x), origin, n,
                                        {target_.row(0, y) + x, target_.row(1, y) + x, target_.row(2, y) + x},
-                                       count, stride, planes);
+                                       count, stride, terms);
                     });
         for (int i = 0; i < tile.height; ++i) {
             for (int j = 0; j < tile.width; j += systems) {
@@ -453,11 +456,11 @@ class Regression {
         const FeatureValues origin = origin_of(tile);
         std::vector<const float*> coefficients(static_cast<std::size_t>(coefficients_.channels()));
         sum_windows(tile, gather_step(), coefficients_.channels() + 1, scratch,
-                    [&](int y, int x, int count, int stride, float* planes) {
+                    [&](int y, int x, int count, int stride, float* terms) {
                         for (int plane = 0; plane < coefficients_.channels(); ++plane)
                             coefficients[static_cast<std::size_t>(plane)] = coefficients_.row(plane, y) + x;
                         carry_coefficients(feature_rows(y, x), origin, n, coefficients.data(), count, stride,
-                                           planes);
+                                           terms);
                     });
         std::array<float, std::size_t{colors} * tile_width> predictions{};
         for (int i = 0; i < tile.height; ++i) {
@@ -478,24 +481,33 @@ class Regression {
     int threads_;
     PaddedPlanes target_;
     PaddedPlanes features_;
-    std::optional<Guide> guide_;
+    std::optional<PaddedGuide> guide_;
     PaddedPlanes coefficients_;
 };
 
 }  // namespace
 
-void regress(ConstImage target, ConstImage features, std::span<const float> penalty, ConstImage guide,
-             ConstImage guide_variance, SearchWindow window, Image out, int threads) {
-    if (features.channels > max_features) throw std::invalid_argument("at most 16 features");
-    if (penalty.size() != static_cast<std::size_t>(features.channels))
-        throw std::invalid_argument("penalty: expected one value per feature");
-    if (target.channels != colors) throw std::invalid_argument("the target must have 3 channels");
-    window.check();
-    const auto valid = [](float value) { return value >= 0 && std::isfinite(value); };
-    if (!std::ranges::all_of(penalty, valid))
-        throw std::invalid_argument("penalties must be finite, and none negative");
+void regress(ConstImage target, ConstImage features, std::span<const float> penalty,
+             const std::optional<Guide>& guide, SearchWindow window, Image out, int threads) {
+    check_channels("target", target, colors);
+    check_same_size("features", features, "target", target);
+    check_same_shape("out", out, "target", target);
+    if (features.channels > max_features)
+        refuse("features", "up to " + std::to_string(max_features) + " channels", features.channels);
+    if (std::ssize(penalty) != features.channels)
+        refuse("penalty", "one value per feature, " + std::to_string(features.channels), penalty.size());
+    for (const float value : penalty) {
+        if (!(value >= 0) || !std::isfinite(value)) refuse("penalty", "finite numbers from 0 on", value);
+    }
+    if (guide) {
+        check_same_size("guide", guide->image, "target", target);
+        check_same_shape("guide_variance", guide->variance, "guide", guide->image);
+        if (guide->image.channels == 0) refuse("guide", "1 channel or more", 0);
+        check_k(guide->k);
+    }
+    check_window(window);
     if (target.size() == 0) return;
-    Regression(target, features, penalty, guide, guide_variance, window, threads).run(out);
+    Regression(target, features, penalty, guide, window, threads).run(out);
 }
 
 }  // namespace tungsten_dip

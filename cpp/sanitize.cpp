@@ -6,6 +6,7 @@
 #include <utility>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 #include "fastest.hpp"
 
@@ -263,6 +264,7 @@ void mend_variance(const Buffer& buffer, Quantity quantity) {
 }  // namespace
 
 BufferDefects find_defects(const ConstBuffer& buffer, Quantity quantity, int threads) {
+    check_buffer(buffer);
     const Rules rules = value_rules(quantity);
     return {.mean = find_defects(buffer.mean, rules, threads),
             .half_a = find_defects(buffer.half_a, rules, threads),
@@ -271,6 +273,7 @@ BufferDefects find_defects(const ConstBuffer& buffer, Quantity quantity, int thr
 }
 
 void mend(const Buffer& buffer, Quantity quantity) {
+    check_buffer(buffer);
     mend_values(buffer, quantity);
     if (buffer.variance.known()) mend_variance(buffer, quantity);
 }

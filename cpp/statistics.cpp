@@ -5,6 +5,7 @@
 #include <limits>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 
 namespace tungsten_dip {
@@ -176,6 +177,8 @@ Ratio measure_ratio(ConstImage a, ConstImage b, ConstImage variance, int threads
 }  // namespace
 
 void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int threads) {
+    check_same_shape("half_b", half_b, "half_a", half_a);
+    check_same_shape("out", out, "half_a", half_a);
     parallel_for(out.height, threads, [&](int y) {
         for (std::ptrdiff_t i = 0; i < out.row_size(); ++i) {
             const float difference = half_a.row(y)[i] - half_b.row(y)[i];
@@ -185,6 +188,8 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 }
 
 HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance, int threads) {
+    check_same_shape("half_b", half_b, "half_a", half_a);
+    if (variance.known()) check_same_shape("variance", variance, "half_a", half_a);
     const Correlation correlation = measure_correlation(half_a, half_b, threads);
     const Ratio ratio = variance.known() ? measure_ratio(half_a, half_b, variance, threads) : Ratio{};
 

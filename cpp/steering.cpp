@@ -5,10 +5,10 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
+#include "checks.hpp"
 #include "core.hpp"
 #include "exp_minus.hpp"
 #include "fastest.hpp"
@@ -216,6 +216,8 @@ class LitBlocks {
 }  // namespace
 
 void structure_tensor(ConstImage features, Image out, int threads) {
+    check_same_size("out", out, "features", features);
+    check_channels("out", out, 3);
     if (out.size() == 0) return;
     const PaddedPlanes planes(features, derivative_radius, threads);
     const auto smooth = gaussian<derivative_radius>(derivative_sigma);
@@ -252,9 +254,12 @@ void smooth_along_edges(ConstImage image, ConstImage tensor_image, float along, 
                         int threads) {
     for (const float sigma : {along, across}) {
         if (sigma >= least_sigma && sigma <= largest_sigma) continue;
-        throw std::invalid_argument("along and across: expected " + std::to_string(least_sigma) + " to " +
-                                    std::to_string(largest_sigma) + " pixels, got " + std::to_string(sigma));
+        refuse("along and across",
+               std::to_string(least_sigma) + " to " + std::to_string(largest_sigma) + " pixels", sigma);
     }
+    check_same_size("tensor", tensor_image, "image", image);
+    check_channels("tensor", tensor_image, 3);
+    check_same_shape("out", out, "image", image);
     if (image.size() == 0) return;
     const int radius = static_cast<int>(std::ceil(reach * std::max(along, across)));
     const PaddedPlanes tensor(tensor_image, radius, threads);

@@ -90,10 +90,11 @@ def regress(
 ) -> FloatImage:
     """Return ``target`` (3 channels) denoised by first-order regression on ``features`` in local windows.
 
-    Neighbours weigh by non-local means of ``guide`` (``guide_variance`` is its noise, same shape), times
-    exp(-sum of ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``,
-    256 at most. At most 16 features; everything must be finite, and features should differ by no more than
-    some tens within a window. See ``regress`` in core.hpp.
+    Neighbours weigh by non-local means of ``guide`` (``guide_variance`` is its noise, same shape; ``k``, how
+    many standard deviations of it apart they may be, is not used without a guide), times exp(-sum of
+    ``penalty`` times squared differences of features). ``radius`` must be a multiple of ``step``, 256 at
+    most. At most 16 features; everything must be finite, and features should differ by no more than some tens
+    within a window. See ``regress`` in core.hpp.
     """
 
 def structure_tensor(features: FloatImage, threads: int) -> FloatImage:

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <iostream>
+#include <stdexcept>
 #include <string>
 #include <type_traits>
 
@@ -44,6 +45,17 @@ inline void check_near(double value, double expected, double tolerance, Place pl
 
 inline void check_below(double value, double bound, Place place) {
     check(value < bound, place, ": expected less than ", bound, ", got ", value);
+}
+
+// What a call says where it refuses its arguments; nothing if it takes them.
+template <typename Call>
+std::string refusal(const Call& call) {
+    try {
+        call();
+    } catch (const std::invalid_argument& error) {
+        return error.what();
+    }
+    return {};
 }
 
 inline int failed_checks() {

@@ -12,12 +12,16 @@ using namespace tungsten_dip;
 
 namespace {
 
-constexpr SearchWindow nearby{.radius = 5, .step = 1, .k = 0.5F};
+// Where values are looked for, and how many standard deviations apart they are alike.
+struct Search {
+    SearchWindow window{.radius = 5, .step = 1};
+    float k = 0.5F;
+};
 
 struct Output {
     Pixels mean, half_a, half_b, variance;
 
-    Output(Render& render, int threads, bool with_variance = true, SearchWindow window = nearby)
+    Output(Render& render, int threads, bool with_variance = true, Search search = {})
         : mean(render.mean), half_a(mean), half_b(mean), variance(mean) {
         Buffer in = render.buffer();
         if (!with_variance) in.variance = {};
@@ -26,7 +30,7 @@ struct Output {
                            .half_a = half_a.view(),
                            .half_b = half_b.view(),
                            .variance = variance.view()},
-                          window, threads);
+                          search.window, search.k, threads);
     }
     bool operator==(const Output&) const = default;
 };
@@ -45,7 +49,7 @@ Render noisy_edge(int height, int width, unsigned seed) {
 }
 
 // One value of half a, straight from the definition in double precision.
-double nl_means(Render& render, SearchWindow window, int y, int x) {
+double nl_means(Render& render, Search search, int y, int x) {
     const int height = render.mean.height;
     const int width = render.mean.width;
     const auto inside = [&](int row, int column) {
@@ -56,6 +60,7 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
     };
     double sum = 0;
     double weights = 0;
+    const auto [window, k] = search;
     for (int dy = -window.radius; dy <= window.radius; dy += window.step) {
         for (int dx = -window.radius; dx <= window.radius; dx += window.step) {
             if (!inside(y + dy, x + dx)) continue;
@@ -68,7 +73,7 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
                     const double difference = static_cast<double>(repeated(render.half_b, py, px)) -
                                               repeated(render.half_b, py + dy, px + dx);
                     distance += std::min((difference * difference - here - std::min(here, there)) /
-                                             (window.k * window.k * (here + there) + 1e-7),
+                                             (k * k * (here + there) + 1e-7),
                                          1e4);
                 }
             }
@@ -83,14 +88,15 @@ double nl_means(Render& render, SearchWindow window, int y, int x) {
 void agrees_with_the_definition() {
     for (const auto& [height, width] :
          {std::pair{13, 11}, std::pair{70, 67}, std::pair{1, 9}, std::pair{9, 1}}) {
-        for (const SearchWindow window :
-             {nearby, {.radius = 2, .step = 1, .k = 0.9F}, {.radius = 6, .step = 3, .k = 0.5F}}) {
+        for (const Search search : {Search{},
+                                    {.window = {.radius = 2, .step = 1}, .k = 0.9F},
+                                    {.window = {.radius = 6, .step = 3}}}) {
             Render render = noisy_edge(height, width, 1);
-            Output out(render, 2, true, window);
+            Output out(render, 2, true, search);
             double worst = 0;
             for (int y = 0; y < height; y += 3) {
                 for (int x = 0; x < width; x += 2) {
-                    worst = std::max(worst, std::abs(out.half_a.at(y, x) - nl_means(render, window, y, x)));
+                    worst = std::max(worst, std::abs(out.half_a.at(y, x) - nl_means(render, search, y, x)));
                 }
             }
             CHECK_BELOW(worst, 1e-5);

@@ -182,19 +182,19 @@ def test_what_does_not_fit_together_is_refused() -> None:
     target, features, guide = images["target"], images["features"], images["guide"]
     penalty = (1.0,) * 4
     many = np.zeros((6, 7, 17), np.float32)
-    with pytest.raises(ValueError, match="at most 16 features"):
+    with pytest.raises(ValueError, match="features: expected up to 16 channels, got 17"):
         _core.regress(target, many, (0.0,) * 17, radius=1, step=1, threads=2)
-    with pytest.raises(ValueError, match="target must have 3 channels"):
+    with pytest.raises(ValueError, match="target: expected 3 channels, got 1"):
         _core.regress(np.zeros((6, 7, 1), np.float32), features, penalty, radius=1, step=1, threads=2)
-    with pytest.raises(ValueError, match="one value per feature"):
+    with pytest.raises(ValueError, match="penalty: expected one value per feature, 4, got 3"):
         _core.regress(target, features, (1.0,) * 3, radius=1, step=1, threads=2)
-    with pytest.raises(ValueError, match="size of the target"):
+    with pytest.raises(ValueError, match="features: expected the height and width of target"):
         _core.regress(target, np.zeros((7, 6, 4), np.float32), penalty, radius=1, step=1, threads=2)
-    with pytest.raises(ValueError, match="size of the target"):
+    with pytest.raises(ValueError, match="guide: expected the height and width of target"):
         _core.regress(target, features, penalty, guide[:5], guide[:5], radius=1, step=1, threads=2)
     with pytest.raises(ValueError, match="both or neither"):
         _core.regress(target, features, penalty, guide, radius=1, step=1, threads=2)
-    with pytest.raises(ValueError, match="as many channels as the guide"):
+    with pytest.raises(ValueError, match="guide_variance: expected the shape of guide"):
         _core.regress(target, features, penalty, guide, target, radius=1, step=1, threads=2)
     with pytest.raises(TypeError, match="target: expected an aligned C-contiguous float32"):
         _core.regress(target.astype(np.float64), features, penalty, radius=1, step=1, threads=2)  # type: ignore[arg-type]
