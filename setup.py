@@ -18,7 +18,9 @@ class CMakeBuild(build_ext):
         root = Path(__file__).parent.resolve()
         source = root / "python" / "tungsten_dip"
         package_dir = source if self.editable_mode else Path(self.build_lib).resolve() / "tungsten_dip"
-        build_dir = root / "build" / "pip"
+        # The folder that setuptools chooses for an editable build is not kept: all would be compiled again.
+        # A wheel has a folder of its own, since the cache names the place of the modules.
+        build_dir = root / "build" / ("editable" if self.editable_mode else "wheel")
         # A cache of an earlier build may name a ninja that pip has removed since.
         ninja = shutil.which("ninja") or "ninja"
         subprocess.check_call(
