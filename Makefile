@@ -10,6 +10,8 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 ifeq ($(origin CXX),default)
 CXX := c++
 endif
+# Where the package's build looks for cmake, and cmake for ninja.
+export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 CXX_FOLDERS := cpp mitsuba_ext tungsten_ext tests/cpp
 CXX_SOURCES := $(shell find $(CXX_FOLDERS) -name '*.[ch]pp')
@@ -38,7 +40,7 @@ stress: $(VENV)/developing ## try hard cases, kills, full disks, hostile files; 
 
 sanitize: $(VENV)/developing ## run the C++ tests under the address, undefined and thread sanitizers
 	for preset in asan tsan; do \
-		PATH="$(CURDIR)/$(BIN):$$PATH" cmake --preset $$preset -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python" \
+		$(BIN)/cmake --preset $$preset -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python" \
 		&& $(BIN)/cmake --build --preset $$preset && $(BIN)/ctest --preset $$preset || exit 1; \
 	done
 
@@ -86,13 +88,13 @@ $(VENV)/installed: $(VENV)/created constraints.txt $(BUILD_FILES) $(CXX_SOURCES)
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' \
 		>$(VENV)/build-requirements.txt
 	$(PIP) --requirement $(VENV)/build-requirements.txt
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[mitsuba]'
+	$(PIP) --no-build-isolation --editable '.[mitsuba]'
 	@touch $@
 
 $(VENV)/developing: $(VENV)/installed
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --editable '.[dev]'
+	$(PIP) --no-build-isolation --editable '.[dev]'
 	@touch $@
 
 build/dev/build.ninja: $(VENV)/developing CMakePresets.json
-	PATH="$(CURDIR)/$(BIN):$$PATH" cmake --preset dev -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python"
+	$(BIN)/cmake --preset dev -DPython_EXECUTABLE="$(CURDIR)/$(BIN)/python"
 	@touch $@
