@@ -41,7 +41,7 @@ constexpr float least_weight_sum = 1e-20F;
 constexpr int patch_radius = 1;
 constexpr int patch_size = 2 * patch_radius + 1;
 
-// Added to the variance of every feature: keeps flat ones from explaining noise.
+// Added to the variance of every feature: keeps flat ones from explaining noise. As a float has it.
 constexpr double ridge = 1e-3F;
 
 struct Tile {

@@ -17,6 +17,8 @@
 namespace tungsten_dip {
 namespace {
 
+// In pixels, of the Gaussian whose derivatives are taken, and of the one that smooths their products; and
+// where the kernels end.
 constexpr float derivative_sigma = 0.7F;
 constexpr int derivative_radius = 3;
 constexpr float tensor_sigma = 2.0F;
@@ -28,6 +30,7 @@ constexpr float reach = 2.0F;
 constexpr float least_sigma = 0.01F;
 constexpr float largest_sigma = max_radius / reach;
 
+// Keeps what is divided by a tensor's trace finite where there is no edge.
 constexpr float least_trace = 1e-12F;
 
 // Neighbours whose weight is below exp(-this), against 1 of the pixel itself, do not change a float's sum.

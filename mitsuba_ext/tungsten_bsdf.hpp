@@ -60,7 +60,7 @@ struct RoughReflection {
         Throw("Expected the distribution beckmann, phong or ggx, got \"%s\"", name);
     }
 
-    // The parameter of the distribution; Phong's is an exponent.
+    // The parameter of the distribution; Phong's is an exponent. Tungsten has no smoother surface than 1e-3.
     [[nodiscard]] float alpha(float of_roughness) const {
         const float clamped = std::max(of_roughness, 1e-3f);
         return distribution == Distribution::Phong ? 2.f / (clamped * clamped) - 2.f : clamped;

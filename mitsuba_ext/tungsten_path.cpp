@@ -387,7 +387,7 @@ class TungstenPath final : public Variant::Integrator {
         }
     }
 
-    // Tungsten's rays begin at the lens and have no end; Mitsuba's lie between two planes.
+    // Tungsten's rays begin at the lens and have no end; Mitsuba's lie between its two clipping planes.
     static void undo_clipping(const Sensor& sensor, Ray3& ray) {
         const auto* camera = dynamic_cast<const Variant::ProjectiveCamera*>(&sensor);
         if (camera == nullptr) return;
@@ -416,6 +416,7 @@ class TungstenPath final : public Variant::Integrator {
                 in_medium ? pass_medium(scene, medium_hit, random, path) : pass_surface(scene, random, path);
             if (!goes_on) return path.radiance;
             if (is_black(path.throughput)) break;
+            // Tungsten's Russian roulette.
             const float survival = dr::max(path.throughput);
             if (path.bounce > 2 && survival < 0.1f) {
                 if (random.next() >= survival) return path.radiance;
