@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.write import write_tungsten_folder
@@ -35,11 +36,23 @@ def write_scene(path: Path, shift: float) -> Path:
     return path
 
 
-def true_frame(folder: Path, shift: float, seed: int, spp: int = 16, light: float = 1.0) -> TrueFrame:
-    """Return the frame of a camera that stands ``shift`` to the right."""
+def true_frame(
+    folder: Path,
+    shift: float,
+    seed: int,
+    spp: int = 16,
+    light: float = 1.0,
+    shade: npt.NDArray[np.float64] | None = None,
+) -> TrueFrame:
+    """Return the frame of a camera that stands ``shift`` to the right.
+
+    Its radiance is multiplied by ``shade``, shape (height, width, 1), which no feature contains.
+    """
     camera = load_scene(write_scene(folder / "camera.json", shift)).camera
     rng = np.random.default_rng(seed)
     albedo, normal, depth, color = _seen(camera, light)
+    if shade is not None:
+        color = color * shade
     shape = SAMPLE_SHAPE * spp / 2
     half_a, half_b = (color * rng.gamma(shape, 1 / shape, color.shape) for _ in range(2))
     variance = color**2 / (SAMPLE_SHAPE * spp)

@@ -14,6 +14,7 @@ from tungsten_dip.buffers.read import read_buffers
 from tungsten_dip.buffers.render_buffers import Buffer, RenderBuffers
 from tungsten_dip.buffers.source import Part
 from tungsten_dip.errors import InputError
+from tungsten_dip.fit import denoise
 from tungsten_dip.fit.network import blend_network, training
 from tungsten_dip.fit.presets import FOLLOWING_DRAFT_PILOTS, FOLLOWING_PILOTS
 from tungsten_dip.fit.settings import FitSettings
@@ -465,6 +466,19 @@ def test_frames_follow_and_gain_from_it(tmp_path):
         flicker(images[3], images[2], frames[3].reference, frames[2].reference) for images in (results, cold)
     )
     assert shown < 0.8 * shown_cold
+
+
+@pytest.mark.parametrize("preset", ["draft", "balanced"])
+def test_a_shadow_that_moves_is_little_worse_than_in_a_first_frame(tmp_path, preset):
+    settings = FitSettings(preset=preset, threads=1)
+    follower, columns = Follower(settings), np.indices((HEIGHT, WIDTH, 1))[1]
+    followed, alone = [], []
+    for n in range(5):
+        shade = np.where((columns - 4 * n) % 24 < 8, 0.1, 1.0)
+        frame = true_frame(tmp_path, 0.0, seed=n, shade=shade)
+        followed.append(relmse(follower.denoise(frame.buffers, frame.camera).result.color, frame.reference))
+        alone.append(relmse(denoise(frame.buffers, settings).color, frame.reference))
+    assert sum(followed[1:]) < 2 * sum(alone[1:])
 
 
 @pytest.mark.parametrize(

@@ -77,36 +77,31 @@ def first_guides(
     return _guides(smooth, irradiances, surfaces, threads, color_variance)
 
 
-def following_guides(
+def filled_frame(
     colors: Halves, previous: Halves, surfaces: tuple[Surfaces, ...], filler: Pilot, threads: int
-) -> tuple[Guides, Halves, Halves]:
-    """Return guides as `first_guides`, at a part of its cost.
+) -> tuple[Halves, Halves]:
+    """Return the images of the pilot ``filler``, and a previous frame that they fill where it has no value.
 
-    ``previous`` are the halves of the previous frame's result, reprojected to this one, NaN where they have
-    no value. They are the guide, filled by the pilot ``filler``. Returns (guides, filler's images, filled
-    previous frame), the last two as linear radiance.
+    ``previous`` are the halves of its result, reprojected to this frame, NaN where they have no value. All
+    are linear radiance in the units of the colours.
     """
-    irradiance_a, irradiance_b = (s.irradiance(color) for s, color in zip(surfaces, colors, strict=True))
-    irradiances = irradiance_a, irradiance_b
     filler_a, filler_b = (
-        s.color(_regress(image, filler, s, threads)) for image, s in zip(irradiances, surfaces, strict=True)
+        s.color(_regress(s.irradiance(color), filler, s, threads))
+        for color, s in zip(colors, surfaces, strict=True)
     )
     filled_a, filled_b = (
         np.where(np.isfinite(image), np.maximum(image, 0), instead).astype(np.float32)
         for image, instead in zip(previous, (filler_a, filler_b), strict=True)
     )
-    smooth = tuple(
-        np.maximum((image - s.smooth_emission) / s.albedo, 0)
-        for image, s in zip((filled_a, filled_b), surfaces, strict=True)
-    )
-    return _guides(smooth, irradiances, surfaces, threads), (filler_a, filler_b), (filled_a, filled_b)
+    return (filler_a, filler_b), (filled_a, filled_b)
 
 
 @dataclass
 class PilotMaker:
     """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `first_guides`.
 
-    ``previous``, the filled frame of `following_guides`, is the guide of pilots of kind color if given.
+    ``previous``, a `filled_frame`, is the guide of pilots of kind color if given. Others are guided by the frame
+    itself: what no feature contains, such as a shadow, may have moved.
     """
 
     colors: tuple[FloatImage, ...]
