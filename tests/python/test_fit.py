@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fitted_models import check_result, short
-from synthetic import SyntheticRender, relmse, synthetic_render
+from synthetic import SyntheticRender, buffer_of_halves, relmse, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise
 
@@ -78,6 +78,21 @@ def test_exposure_changes_nothing_but_the_exposure(exponent: int, render: Synthe
     assert plain.estimated_relmse is not None
     # The 0.01 of the relMSE is in the unit of the colour.
     assert (scaled.estimated_relmse > plain.estimated_relmse) == (exponent > 0)
+
+
+@pytest.mark.parametrize("noise_of_sky", [0.0, 0.1])
+@pytest.mark.parametrize("darker", [0.01, 0.001])
+def test_what_a_bright_sky_outshines_is_denoised(noise_of_sky: float, darker: float) -> None:
+    """It is most of the picture, and the foreground has next to nothing of its radiance."""
+    sky = np.repeat((np.indices((50, 64))[0] < 30)[:, :, None], 3, axis=2)
+    truth = np.where(sky, 1, darker).astype(np.float32)
+    shape = np.where(sky, 1 / max(noise_of_sky, 1e-4) ** 2, 2)
+    rng = np.random.default_rng(0)
+    a, b = (np.float32(truth * rng.gamma(shape, 1 / shape)) for _ in range(2))
+    depth = Buffer(np.where(sky[:, :, :1], 0, 3).astype(np.float32))
+    result = denoise(RenderBuffers(buffer_of_halves(a, b), depth=depth), short())
+    noisy, denoised = (np.mean((image / darker - 1)[~sky] ** 2) for image in ((a + b) / 2, result.color))
+    assert denoised < 0.1 * noisy
 
 
 @pytest.mark.filterwarnings("error")

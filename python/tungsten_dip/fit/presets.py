@@ -33,8 +33,8 @@ FINAL_PILOTS = (
     Pilot("guided", 32, step=4, k=2.0, with_position=True),
 )
 
-# Enough beside the previous frame. The first replaces it where it has no value, guided ones see what has moved
-# although no feature contains it.
+# Enough beside the previous frame. The first replaces it where it has no value, guided ones show what has
+# moved although no feature contains it.
 FOLLOWING_DRAFT_PILOTS = (Pilot("features", 1), _EDGES, Pilot("guided", 9, step=3, k=1.0))
 FOLLOWING_PILOTS = (
     Pilot("features", 1),

@@ -100,8 +100,8 @@ def filled_frame(
 class PilotMaker:
     """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `first_guides`.
 
-    ``previous``, a `filled_frame`, is the guide of pilots of kind color if given. Others are guided by the frame
-    itself: what no feature contains, such as a shadow, may have moved.
+    ``previous``, a `filled_frame`, is the guide of pilots of kind color if given. Others are guided by the
+    frame itself: what no feature contains, such as a shadow, may have moved.
     """
 
     colors: tuple[FloatImage, ...]
