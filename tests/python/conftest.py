@@ -17,6 +17,7 @@ from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers
 from tungsten_dip.buffers.write import write_tungsten_folder
 from tungsten_dip.fit import FitResult, FitSettings, denoise
 from tungsten_dip.fit.model import Model
+from tungsten_dip.fit.preparation.exposure import exposure
 from tungsten_dip.fit.result import HistoryPoint
 from tungsten_dip.onnx import save_model
 from tungsten_dip.progress import silent
@@ -142,8 +143,8 @@ def oidn_images(monkeypatch: pytest.MonkeyPatch) -> list[FloatImage]:
     images: list[FloatImage] = []
     monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: object())
 
-    def given(buffers: RenderBuffers, colors: Any, scale: float, threads: int) -> tuple[FloatImage, ...]:
-        return tuple(image * np.float32(scale) for image in images)
+    def given(buffers: RenderBuffers, colors: Any, threads: int) -> tuple[FloatImage, ...]:
+        return tuple(image * np.float32(exposure(buffers.color)) for image in images)
 
     for module in ("evidence", "output.all_samples"):
         monkeypatch.setattr(f"tungsten_dip.fit.{module}.oidn_pilot", given)

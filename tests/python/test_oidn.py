@@ -1,4 +1,5 @@
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,3 +110,16 @@ def test_without_halves_it_is_a_pilot_too(render):
     result = denoise(buffers, FitSettings("draft", pilot="oidn", threads=1))
     assert result.model.blend.layout.extra_count == 1
     assert any("no half buffers" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("exponent", [-80, 60])
+def test_as_a_pilot_it_does_the_same_at_any_exposure(render, exponent):
+    scale = np.float32(2.0**exponent)
+    color = render.buffers.color
+    scaled = Buffer(color.mean * scale, color.half_a * scale, color.half_b * scale)
+    settings = FitSettings("draft", pilot="oidn", threads=1)
+    # The albedo of emitted light would be in another unit.
+    plain = render.buffers.with_quantities(color=replace(color, variance=None), albedo=None)
+    expected = denoise(plain, settings).color
+    found = denoise(plain.with_quantities(color=scaled), settings).color
+    np.testing.assert_allclose(found / scale, expected, rtol=1e-3)

@@ -32,6 +32,9 @@ from tungsten_dip.progress import Progress
 _NEAR_RADIUS = 2
 """Radius of the window in which no sample may have hit anything, for a pixel to be empty space."""
 
+_LAMP_RADIUS = 8
+"""Radius of the window in which a lamp leaves no pixel unlit."""
+
 PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
 """Parts of a time budget after which no further pilot, or none of draft's, begins. Training gets the rest."""
@@ -41,7 +44,8 @@ _DRAFT_SHARE = 0.7
 class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``guide_variance`` is that of the pilots' guides (see
+    ``mean`` is the noisy image, without fireflies. ``unlit``, shape (height, width, 1), is 1 in pixels that
+    have no lamp in the 17x17 pixels around, else 0. ``guide_variance`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`). ``halves_drawn``
     and ``notes`` are those of the result (`FitResult`).
     """
@@ -50,6 +54,7 @@ class Evidence:
     mean: FloatImage
     layout: Layout
     candidates: Candidates
+    unlit: FloatImage
     guide_variance: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
@@ -110,7 +115,7 @@ def evidence_from_buffers(
     stage(progress, "features")(1.0, "features")
     extra_pilots: list[Halves] = []
     if with_oidn:
-        a, b = oidn_pilot(buffers, halves, scale, threads)
+        a, b = oidn_pilot(buffers, halves, threads)
         extra_pilots.append((a, b))
         stage(progress, "extra pilots")(1.0, "Open Image Denoise")
     if layout is not None:
@@ -143,6 +148,7 @@ def evidence_from_buffers(
         mean=mean,
         layout=layout,
         candidates=candidates,
+        unlit=_unlit_pixels(surfaces, threads),
         guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
@@ -226,6 +232,12 @@ def occupied_pixels(halves: Halves, buffers: RenderBuffers, threads: int) -> Flo
     hit = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
     near = _core.box_mean(hit.astype(np.float32), _NEAR_RADIUS, threads) > 0
     return near.astype(np.float32)
+
+
+def _unlit_pixels(surfaces: Sequence[Surfaces], threads: int) -> FloatImage:
+    emits = np.any([(s.emission > 0).any(axis=2, keepdims=True) for s in surfaces], axis=0)
+    near = _core.box_mean(emits.astype(np.float32), _LAMP_RADIUS, threads) > 0
+    return (~near).astype(np.float32)
 
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:

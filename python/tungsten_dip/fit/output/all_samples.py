@@ -61,7 +61,7 @@ def pilots_of_all_samples(
             return ()
         computed.append(maker.images(pilot)[0] * occupied)
     if with_oidn:
-        computed.extend(oidn_pilot(buffers, colors, evidence.scale, threads))
+        computed.extend(oidn_pilot(buffers, colors, threads))
     return (evidence.mean, *computed)
 
 

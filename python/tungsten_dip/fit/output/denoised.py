@@ -17,6 +17,7 @@ from tungsten_dip.buffers.render_buffers import (
 from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.output.all_samples import with_all_samples
 from tungsten_dip.fit.output.lost_detail import with_lost_detail
+from tungsten_dip.fit.output.lost_light import gain_of_lost_light
 from tungsten_dip.fit.preparation.exposure import exposure, unscaled
 from tungsten_dip.fit.result import DenoisedImage
 from tungsten_dip.fit.scoring.estimate import (
@@ -75,6 +76,9 @@ def denoised_image(
         # What the halves' blends lost, that of all samples lost with the same weights.
         with_detail = np.maximum(all_samples_blend + (image - blended), 0)
         image = with_all_samples(denoised, with_detail, threads)
+    if not evidence.halves_drawn:
+        light = gain_of_lost_light(noisy, mean_of(denoised), evidence.unlit, threads)
+        image, denoised = image * light, (denoised[0] * light, denoised[1] * light)
     pixels = denoised[0].reshape(-1, 3), denoised[1].reshape(-1, 3)
     error = estimate_error(evidence.candidates, evidence.scale, pixels).reshape(*image.shape[:2], 1)
 

@@ -16,7 +16,6 @@ from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import require
 from tungsten_dip.fit.pilots.surfaces import images_for
-from tungsten_dip.fit.preparation.exposure import scaled
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,18 +78,19 @@ def oidn_image(
 
 
 def oidn_pilot(
-    buffers: RenderBuffers, colors: tuple[FloatImage, ...], scale: float, threads: int
+    buffers: RenderBuffers, colors: tuple[FloatImage, ...], threads: int
 ) -> tuple[FloatImage, ...]:
     """Denoise both halves, each with its own features alone, or the mean; the results are never negative.
 
-    ``colors`` are the two halves, or the mean alone: linear radiance in the renderer's units times ``scale``,
-    shape (height, width, 3). So are the results.
+    ``colors`` are the two halves, or the mean alone, shape (height, width, 3), linear radiance in the units
+    of `evidence.Evidence`: in a renderer's, Open Image Denoise would take very dark images for black. So are
+    the results.
     """
     features = (
         images_for(colors, feature) if feature else [None] * len(colors)
         for feature in (buffers.albedo, buffers.normal)
     )
     return tuple(
-        np.maximum(scaled(oidn_image(color / np.float32(scale), *given, threads=threads), scale), 0)
+        np.maximum(oidn_image(color, *given, threads=threads), 0)
         for color, *given in zip(colors, *features, strict=True)
     )
