@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "python" / "tungsten_dip"
 
@@ -54,6 +56,21 @@ def test_the_table_of_a_fit_lists_every_module() -> None:
     assert sorted(parts_of_fit()) == sorted(
         folders | {path.stem for path in (PACKAGE / "fit").glob("*.py")} - {"__init__"}
     )
+
+
+@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+def test_names_of_code_on_a_page_exist(page: str) -> None:
+    sources = [
+        *PACKAGE.rglob("*.py"),
+        *ROOT.glob("cpp/*"),
+        *ROOT.glob("*_ext/*.?pp"),
+        *ROOT.glob("tests/*/*.py"),
+    ]
+    code = "\n".join(path.read_text() for path in sources if path.is_file())
+    names = set(re.findall(r"`(?:\w+\.)?(\w*[A-Z_]\w*)`", (ROOT / page).read_text()))
+    words = set(re.findall(r"\w+", code))
+    assert names - words <= {"x_from_y"}
+    assert names
 
 
 def test_imports_within_a_fit_point_downwards_only() -> None:
