@@ -17,7 +17,6 @@ import numpy as np
 
 from tungsten_dip.buffers.render_buffers import (
     CHANNELS,
-    FEATURES,
     MOST_SPP,
     Buffer,
     FloatImage,
@@ -36,7 +35,7 @@ from tungsten_dip.scene.types import Scene
 
 _LOG = logging.getLogger(__name__)
 
-QUANTITIES: tuple[Quantity, ...] = ("color", *FEATURES)
+QUANTITIES: tuple[Quantity, ...] = ("color", "albedo", "normal", "depth")
 """What is rendered unless something else is asked for; colour is always there."""
 
 _TRACE_SETTINGS = (
