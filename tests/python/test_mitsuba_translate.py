@@ -456,6 +456,13 @@ def test_a_smooth_mesh_shines_on_the_side_of_its_faces(folder: Path) -> None:
     assert smooth == pytest.approx(flat, rel=0.02)
 
 
+def test_a_flattened_mesh_has_the_normals_of_its_faces(folder: Path) -> None:
+    wall = {"type": "mesh", "file": "mesh.obj", "smooth": True, "recompute_normals": True, "bsdf": GREY}
+    flat = {**wall, "transform": {"scale": [1, 1, 0]}}
+    seen = render(folder, [flat], {"fov": 2, "transform": {"position": [0, 0.5, 3], "look_at": [0, 0.5, 0]}})
+    np.testing.assert_allclose(np.abs(seen.normal.mean), np.broadcast_to([0, 0, 1], (12, 16, 3)), atol=1e-6)
+
+
 ROOF = """v -1 2 -1
 v 1 2 -1
 v 1 2 1
@@ -1074,3 +1081,4 @@ def test_what_is_approximated_is_told(folder: Path, caplog: pytest.LogCaptureFix
     assert len(caplog.messages) == 1
     for part in (str(path), 'bsdf "varnish"', "(mirror)", "--host tungsten"):
         assert part in caplog.messages[0]
+    "skydome of temperature": {"primitives": [{"type": "skydome", "temperature": 20}]},

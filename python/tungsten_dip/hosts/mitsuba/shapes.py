@@ -101,7 +101,9 @@ def _mesh(builder: SceneBuilder, primitive: ts.Mesh) -> list[Any]:
     positions = mesh.positions @ matrix[:3, :3].T + matrix[:3, 3]
     # The inverse scale comes last in Tungsten, which bends normals under a rotation with an uneven scale.
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    normals = mesh.normals @ matrix[:3, :3].T / lengths**2 if primitive.smooth else None
+    # What is flattened has no such normals (in Tungsten they are NaN), but those of its faces.
+    is_smooth = primitive.smooth and lengths.all()
+    normals = mesh.normals @ matrix[:3, :3].T / lengths**2 if is_smooth else None
     corners = positions[mesh.triangles]
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = float(0.5 * np.linalg.norm(np.cross(*edges), axis=1).sum())

@@ -28,6 +28,7 @@ _WAVELENGTHS_NM = np.arange(320.0, 721.0, 40.0)
 _SUN = np.array(
     [7500.0, 12500.0, 21127.5, 26760.5, 30663.7, 27825.0, 25503.8, 25134.2, 23212.1, 21526.7, 19870.8]
 )
+_COLDEST_SUN_K = 30  # the light of a colder one is 0 in floating point
 _BLACKBODY_SCALE = 3.19992e-10
 _RGB_FROM_XYZ = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
@@ -37,13 +38,18 @@ _RGB_FROM_XYZ = np.array(
 def sky_pixels(builder: SceneBuilder, skydome: Skydome) -> _Array:
     """Return the sky's radiance over latitude and longitude, shape (256, 512, 3), row 0 at the zenith.
 
-    Raises InputError where the model is not defined: a sun below the horizon, turbidity beyond 1 to 10.
+    Raises InputError where the model is not defined: a sun that is below the horizon or emits no light,
+    turbidity beyond 1 to 10.
     """
     sun = skydome.world_from_local[:3, 1]
     if not 1.0 <= skydome.turbidity <= 10.0:
         raise builder.unsupported(f"a skydome of turbidity {skydome.turbidity} (expected 1 to 10)")
     if sun[1] < 0.0:
         raise builder.unsupported("a skydome whose sun is below the horizon")
+    if skydome.temperature < _COLDEST_SUN_K:
+        raise builder.unsupported(
+            f"a skydome of temperature {skydome.temperature} (expected {_COLDEST_SUN_K} K or more)"
+        )
     elevation = math.asin(min(float(sun[1]), 1.0))
 
     theta = (np.arange(_HEIGHT // 2) + 0.5)[:, None] * math.pi / _HEIGHT
@@ -97,7 +103,8 @@ def _radiance(skydome: Skydome, elevation: float, theta: _Array, gamma: _Array) 
 def _emission_correction(skydome: Skydome) -> _Array:
     """Return a sun's spectrum over our sun's, of equal mean over the visible bands, times its intensity."""
     metres = _WAVELENGTHS_NM * 1e-9
-    planck = 3.74177e-16 / metres**5 / np.expm1(0.0143878 / (metres * skydome.temperature))
+    exponent = 0.0143878 / (metres * skydome.temperature)
+    planck = 3.74177e-16 / metres**5 * np.exp(-exponent) / -np.expm1(-exponent)
     ratio = planck * _BLACKBODY_SCALE / _SUN
     return np.asarray(skydome.intensity * ratio / ratio[2:].mean())
 
