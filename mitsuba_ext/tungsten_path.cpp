@@ -411,7 +411,8 @@ class TungstenPath final : public Variant::Integrator {
             auto medium_hit = dr::zeros<MediumHit>();
             const bool in_medium = path.medium != nullptr && scatters(*path.medium, path.ray, path.hit.t,
                                                                       random, path.throughput, medium_hit);
-            if (!in_medium && !path.hit.is_valid()) break;
+            // No light comes from endlessly far within a medium, and nothing is seen there.
+            if (!in_medium && !path.hit.is_valid()) return path.radiance;
             const bool goes_on =
                 in_medium ? pass_medium(scene, medium_hit, random, path) : pass_surface(scene, random, path);
             if (!goes_on) return path.radiance;
@@ -566,7 +567,7 @@ class TungstenPath final : public Variant::Integrator {
                          MediumHit& hit) {
         const auto [sigma_s, sigma_n, sigma_t] = medium.get_scattering_coefficients(hit);
         if (is_black(sigma_s)) {
-            throughput *= std::isfinite(surface_t) ? Rgb(dr::exp(-surface_t * sigma_t)) : Rgb(0.f);
+            throughput *= dr::exp(-surface_t * sigma_t);
             return false;
         }
         // The channel that picks the distance is random; the balance heuristic over all three keeps colour

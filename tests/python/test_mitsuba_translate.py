@@ -525,6 +525,16 @@ def test_a_light_that_is_not_sampled_lights_nothing_where_a_later_one_hides_it(
         np.testing.assert_allclose(lit.mean(), 0.5 * irradiance_over_pi, rtol=0.02)
 
 
+def test_what_escapes_within_endless_haze_is_not_seen(folder: Path) -> None:
+    haze = {"name": "haze", "type": "homogeneous", "sigma_a": 0.1}
+    buffers = render(folder, [ball(), WHITE_SKY], {"medium": "haze"}, [haze], spp=16)
+    sky = buffers.depth.mean[..., 0] == 0
+    assert 0 < sky.sum() < sky.size
+    for _, buffer in buffers.quantities():
+        np.testing.assert_array_equal(buffer.mean[sky], 0)
+    assert buffers.albedo.mean[~sky].all()
+
+
 def test_no_light_comes_through_endless_fog(folder: Path) -> None:
     fog = {"name": "fog", "type": "homogeneous", "sigma_s": 0.01}
     for camera, expected in (({"medium": "fog"}, 0.0), ({}, 0.5)):
