@@ -542,14 +542,37 @@ def test_no_light_comes_through_endless_fog(folder: Path) -> None:
         assert buffers.color.mean[-1].mean() == pytest.approx(expected, abs=0.02)
 
 
+def reflected(folder: Path, bsdf: Json, side: int, angle_deg: float = 0.0, **integrator: Any) -> float:
+    """How much of a white sky a wall reflects on its front (1) or back (-1), seen at this angle."""
+    wall = {"type": "quad", "transform": {"rotation": [side * 90, 0, 0], "scale": 3}, "bsdf": bsdf}
+    angle = math.radians(angle_deg)
+    eye = {"position": [2 * math.sin(angle), 0, 2 * math.cos(angle)], "look_at": [0, 0, 0]}
+    path_tracer = {"type": "path_tracer", **integrator}
+    seen = render(folder, [wall, WHITE_SKY], {"fov": 1, "transform": eye}, spp=64, integrator=path_tracer)
+    return float(seen.color.mean.mean())
+
+
 @pytest.mark.parametrize("kind", ["dielectric", "rough_dielectric"])
-@pytest.mark.parametrize("turn", [90, -90])
-def test_glass_that_does_not_refract_reflects_on_both_sides(folder: Path, kind: str, turn: float) -> None:
+@pytest.mark.parametrize("turned", [True, False])
+def test_glass_that_does_not_refract_reflects_on_both_sides(folder: Path, kind: str, turned: bool) -> None:
     glass = {"type": kind, "ior": 1.5, "roughness": 0.01, "enable_refraction": False, "albedo": 0.5}
-    wall = {"type": "quad", "transform": {"rotation": [turn, 0, 0], "scale": 3}, "bsdf": glass}
-    ahead = {"fov": 1, "transform": {"position": [0, 0, 2], "look_at": [0, 0, 0]}}
-    buffers = render(folder, [wall, WHITE_SKY], ahead, spp=64)
-    assert buffers.color.mean.mean() == pytest.approx(0.5 * 0.04, rel=0.01)
+    for side in (1, -1):
+        seen = reflected(folder, glass, side, enable_two_sided_shading=turned)
+        assert seen == pytest.approx(0.5 * 0.04, rel=0.01)
+    # From within the glass, and beyond its critical angle.
+    seen = reflected(folder, glass, -1, 60.0, enable_two_sided_shading=turned)
+    assert seen == pytest.approx(0.5 * 0.0892 if turned else 0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_metal_reflects_more_than_it_gets_behind_it_unless_it_is_turned(folder: Path, turned: bool) -> None:
+    metal = {"type": "conductor", "eta": [0.5, 0.5, 0.5], "k": [2, 2, 2], "albedo": 0.5}
+    reflectance = (0.5**2 + 2**2) / (1.5**2 + 2**2)
+    for side, expected in ((1, reflectance), (-1, reflectance if turned else 1 / reflectance)):
+        seen = reflected(folder, metal, side, enable_two_sided_shading=turned)
+        assert seen == pytest.approx(0.5 * expected, rel=1e-3)
+    mirror = {"type": "mirror", "albedo": 0.5}
+    assert reflected(folder, mirror, -1, enable_two_sided_shading=turned) == pytest.approx(0.5, rel=1e-5)
 
 
 def test_a_bitmap_of_several_bsdfs_is_loaded_once(folder: Path) -> None:

@@ -128,9 +128,8 @@ def _node(builder: SceneBuilder, bsdf: ts.Bsdf, uv: Matrix) -> Node:
         return {"type": "mask", "opacity": opacity, "nested": _node(builder, bsdf.base, uv)}
     one_sided = _one_sided(builder, bsdf, uv)
     has_both_sides = _transmits(bsdf) or isinstance(bsdf, ts.ThinSheetBsdf | ts.ForwardBsdf)
-    # A mirror reflects on both sides of its own accord.
-    turned = builder.source.integrator.enable_two_sided_shading or isinstance(bsdf, ts.MirrorBsdf)
-    return one_sided if has_both_sides or not turned else {"type": "twosided", "nested": one_sided}
+    turned = builder.source.integrator.enable_two_sided_shading and not has_both_sides
+    return {"type": "twosided", "nested": one_sided} if turned else one_sided
 
 
 def _one_sided(builder: SceneBuilder, bsdf: ts.Bsdf, uv: Matrix) -> Node:
@@ -163,24 +162,31 @@ def _phong(builder: SceneBuilder, bsdf: ts.PhongBsdf, uv: Matrix) -> Node:
 
 
 def _mirror(builder: SceneBuilder, bsdf: ts.MirrorBsdf, uv: Matrix) -> Node:
-    return {"type": "conductor", "material": "none", "specular_reflectance": _albedo(builder, bsdf, uv)}
+    return {"type": "tungsten_conductor", "albedo": _albedo(builder, bsdf, uv)}
 
 
-def _conductor(builder: SceneBuilder, bsdf: ts.ConductorBsdf | ts.RoughConductorBsdf, uv: Matrix) -> Node:
-    node = {
-        "type": "conductor",
+def _conductor(builder: SceneBuilder, bsdf: ts.ConductorBsdf, uv: Matrix) -> Node:
+    return {
+        "type": "tungsten_conductor",
+        "albedo": _albedo(builder, bsdf, uv),
+        "eta": {"type": "rgb", "value": list(bsdf.eta)},
+        "k": {"type": "rgb", "value": list(bsdf.k)},
+    }
+
+
+def _rough_conductor(builder: SceneBuilder, bsdf: ts.RoughConductorBsdf, uv: Matrix) -> Node:
+    return {
+        "type": "roughconductor",
         "eta": constant(bsdf.eta),
         "k": constant(bsdf.k),
+        **_microfacets(builder, bsdf, uv),
         "specular_reflectance": _albedo(builder, bsdf, uv),
     }
-    if isinstance(bsdf, ts.RoughConductorBsdf):
-        node |= {"type": "roughconductor", **_microfacets(builder, bsdf, uv)}
-    return node
 
 
 def _dielectric(builder: SceneBuilder, bsdf: ts.DielectricBsdf, uv: Matrix) -> Node:
     if not bsdf.enable_refraction:
-        return _reflecting_glass(builder, bsdf, uv)
+        return _reflecting_glass(builder, bsdf, uv, {"type": "conductor"})
     return {"type": "dielectric", **_refraction(builder, bsdf, uv)}
 
 
@@ -189,25 +195,25 @@ _LEAST_BEND = 1e-4
 
 def _rough_dielectric(builder: SceneBuilder, bsdf: ts.RoughDielectricBsdf, uv: Matrix) -> Node:
     if not bsdf.enable_refraction:
-        return _reflecting_glass(builder, bsdf, uv) | {
-            "type": "roughconductor",
-            **_microfacets(builder, bsdf, uv),
-        }
+        rough = {"type": "roughconductor", **_microfacets(builder, bsdf, uv)}
+        return _reflecting_glass(builder, bsdf, uv, rough)
     node = {"type": "roughdielectric", **_refraction(builder, bsdf, uv), **_microfacets(builder, bsdf, uv)}
     # Mitsuba's has no half-vectors where nothing is bent, and refuses.
     return node | {"int_ior": bsdf.ior if abs(bsdf.ior - 1) > _LEAST_BEND else 1 + _LEAST_BEND}
 
 
 def _reflecting_glass(
-    builder: SceneBuilder, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix
+    builder: SceneBuilder, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix, surface: Node
 ) -> Node:
-    """Glass that reflects alone: a metal that does not absorb."""
-    return {
-        "type": "conductor",
-        "eta": constant(bsdf.ior),
-        "k": constant(0.0),
-        "specular_reflectance": _albedo(builder, bsdf, uv),
-    }
+    """Glass that reflects alone: a ``surface`` of a metal that does not absorb."""
+    albedo = _albedo(builder, bsdf, uv)
+    front, back = (
+        {**surface, "eta": constant(ior), "k": constant(0.0), "specular_reflectance": albedo}
+        for ior in (bsdf.ior, 1 / bsdf.ior)
+    )
+    # What is not turned towards the viewer is seen from within the glass.
+    turned = builder.source.integrator.enable_two_sided_shading
+    return front if turned else {"type": "twosided", "front": front, "back": back}
 
 
 def _refraction(builder: SceneBuilder, bsdf: ts.DielectricBsdf | ts.RoughDielectricBsdf, uv: Matrix) -> Node:
@@ -323,7 +329,7 @@ _TRANSLATORS: dict[type[ts.Bsdf], Callable[[SceneBuilder, Any, Matrix], Node]] =
     ts.PhongBsdf: _phong,
     ts.MirrorBsdf: _mirror,
     ts.ConductorBsdf: _conductor,
-    ts.RoughConductorBsdf: _conductor,
+    ts.RoughConductorBsdf: _rough_conductor,
     ts.DielectricBsdf: _dielectric,
     ts.RoughDielectricBsdf: _rough_dielectric,
     ts.PlasticBsdf: _plastic,
