@@ -2,10 +2,10 @@
 // the differences of texels, however far apart these are on the surface.
 //
 //   (nested)   the BSDF
-//   slopes     texture of three channels: what the height gains from the texel on the left of a place to the
-//              one on its right, and from the one above to the one below; the third is not used
+//   slopes     bitmap of three channels, repeated and not interpolated, over Tungsten's UV: what the height
+//              gains from the texel on the left of one to that on its right, and from the one above to the
+//              one below; the third is not used
 //   shape      mesh, cube or quad: which tangents Tungsten bends
-//   consistent bool: whether light must be on the same side of the bent surface and of the flat one
 #include <string>
 
 #include "tungsten_bsdf.hpp"
@@ -26,7 +26,6 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
         const auto shape = props.get<std::string>("shape");
         if (shape != "mesh" && shape != "cube" && shape != "quad")
             Throw("Expected the shape mesh, cube or quad, got \"%s\"", shape);
-        consistent_ = props.get<bool>("consistent", false);
         unit_ = shape != "quad";
         mirrors_ = shape == "mesh";
         for (size_t i = 0; i < nested_->component_count(); ++i) Base::add_component(nested_->flags(i));
@@ -37,15 +36,16 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
                                              Mask active) const override {
         const SurfaceInteraction3f bent = bent_interaction(si);
         auto [bs, weight] = nested_->sample(context, bent, sample1, sample2, active);
-        const Vector3f direction = bent.to_world(bs.wo);
-        const bool is_kept = is_consistent(si, direction, bs.wo);
-        bs.wo = si.to_local(direction);
-        if (!is_kept) bs.pdf = 0.f;
-        return {bs, is_kept ? weight : Spectrum(0.f)};
+        bs.wo = si.to_local(bent.to_world(bs.wo));
+        return {bs, weight};
     }
 
     Spectrum eval_null_transmission(const SurfaceInteraction3f& si, Mask active) const override {
-        return nested_->eval_null_transmission(si, active);
+        return nested_->eval_null_transmission(bent_interaction(si), active);
+    }
+
+    Frame3f sh_frame(const SurfaceInteraction3f& si, Mask /*active*/) const override {
+        return bent_interaction(si).sh_frame;
     }
 
     MI_DECLARE_CLASS(Bump)
@@ -53,16 +53,24 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
   protected:
     std::pair<Spectrum, Float> evaluate(const SurfaceInteraction3f& si, const Vector3f& wo) const override {
         const SurfaceInteraction3f bent = bent_interaction(si);
-        const Vector3f direction = si.to_world(wo);
-        const Vector3f bent_wo = bent.to_local(direction);
-        if (!is_consistent(si, direction, bent_wo)) return {Spectrum(0.f), 0.f};
-        return nested_->eval_pdf(BSDFContext(), bent, bent_wo, true);
+        return nested_->eval_pdf(BSDFContext(), bent, bent.to_local(si.to_world(wo)), true);
     }
 
   private:
-    bool is_consistent(const SurfaceInteraction3f& si, const Vector3f& direction,
-                       const Vector3f& bent_wo) const {
-        return !consistent_ || (dr::dot(Vector3f(si.n), direction) < 0.f) == (bent_wo.z() < 0.f);
+    // Tungsten rounds the coordinates of texels towards 0. Where they are negative (from the centre of the
+    // first texel to the left, or upwards) it extrapolates from the next two.
+    Color3f interpolated_slope(SurfaceInteraction3f si) const {
+        const Vector2f size(slopes_->resolution());
+        const Point2f place(si.uv.x() * size.x() - 0.5f, (1.f - si.uv.y()) * size.y() - 0.5f);
+        const Point2f first = dr::trunc(place);
+        const Vector2f weight = place - first;
+        const auto texel = [&](Float right, Float below) {
+            si.uv =
+                Point2f((first.x() + right + 0.5f) / size.x(), 1.f - (first.y() + below + 0.5f) / size.y());
+            return slopes_->eval_3(si, true);
+        };
+        return dr::lerp(dr::lerp(texel(0.f, 0.f), texel(1.f, 0.f), weight.x()),
+                        dr::lerp(texel(0.f, 1.f), texel(1.f, 1.f), weight.x()), weight.y());
     }
 
     SurfaceInteraction3f bent_interaction(const SurfaceInteraction3f& si) const {
@@ -77,7 +85,7 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
             tangent = -tangent;
             bitangent = -bitangent;
         }
-        const Color3f slope = slopes_->eval_3(si, true);
+        const Color3f slope = interpolated_slope(si);
         tangent += n * (slope.x() - dr::dot(n, tangent));
         bitangent += n * (slope.y() - dr::dot(n, bitangent));
         Vector3f bent_n = dr::cross(tangent, bitangent);
@@ -95,8 +103,7 @@ class Bump final : public TungstenBsdf<Float, Spectrum> {
 
     ref<BSDF> nested_;
     ref<Texture> slopes_;
-    bool unit_;  // tangents have length 1, not that of the quad's edges
-    bool consistent_;
+    bool unit_;     // tangents have length 1, not that of the quad's edges
     bool mirrors_;  // tangents point the other way where the texture is mirrored
 };
 

@@ -478,7 +478,7 @@ class TungstenPath final : public Variant::Integrator {
         if (emitter != nullptr && path.bounce >= min_bounces_ && is_lit_by)
             path.radiance += path.throughput * emitted(scene, hit, *emitter, path);
         if (next.kind != Scattering::forward) {
-            goes_on = goes_on && is_consistent(hit, direction, next.local_direction);
+            goes_on = goes_on && is_consistent(bsdf, hit, direction);
             if (goes_on) {
                 path.was_specular = next.kind == Scattering::specular;
                 path.vertex = hit;
@@ -550,9 +550,10 @@ class TungstenPath final : public Variant::Integrator {
         return result;
     }
 
-    [[nodiscard]] bool is_consistent(const SurfaceHit& hit, const Vector3& direction,
-                                     const Vector3& local) const {
-        return !consistency_checks_ || (dr::dot(hit.n, direction) < 0.f) == (local.z() < 0.f);
+    [[nodiscard]] bool is_consistent(const Variant::BSDF& bsdf, const SurfaceHit& hit,
+                                     const Vector3& direction) const {
+        return !consistency_checks_ ||
+               (dr::dot(hit.n, direction) < 0.f) == (dr::dot(bsdf.sh_frame(hit, true).n, direction) < 0.f);
     }
 
     [[nodiscard]] Rgb surface_albedo(const Variant::BSDF& bsdf, const SurfaceHit& hit) const {
@@ -615,7 +616,7 @@ class TungstenPath final : public Variant::Integrator {
         const SurfaceHit& hit = path.hit;
         const LightSample light = sample_light(scene, hit, random);
         const Vector3 local = hit.to_local(light.direction.d);
-        if (!is_consistent(hit, light.direction.d, local)) return {};
+        if (!is_consistent(bsdf, hit, light.direction.d)) return {};
         const auto [value, pdf] = bsdf.eval_pdf(BSDFContext(), hit, local);
         const Medium* medium =
             hit.is_medium_transition() ? hit.target_medium(light.direction.d) : path.medium;

@@ -994,6 +994,84 @@ def test_height_map_leaves_triangles_without_area_in_uv_flat(folder: Path) -> No
     assert bumpy == pytest.approx(flat, rel=1e-5)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_height_map_left_of_its_first_texel_and_above_it_goes_on_as_behind_it(
+    axis: int, tmp_path: Path
+) -> None:
+    """As in Tungsten: interpolation would flatten the first half texel, towards the last one's slope."""
+    heights = np.array([0, 60, 60, 0], np.uint8)
+    slope = 2 * 60 / 255  # of both the first and the second texel, per texel of 1 / 2
+    rows = np.broadcast_to(heights[:, None, None], (4, 4, 3))
+    write_image(tmp_path / "heights.png", np.ascontiguousarray(rows if axis else rows.swapaxes(0, 1)))
+    near = (
+        "vt 0 0.7\nvt 1 0.7\nvt 1 1.1\nvt 0 1.1\n" if axis else "vt -0.1 0\nvt 0.3 0\nvt 0.3 1\nvt -0.1 1\n"
+    )
+    (tmp_path / "plate.obj").write_text(
+        f"v -4 0 -4\nv 4 0 -4\nv 4 0 4\nv -4 0 4\n{near}f 1/1 3/3 2/2\nf 1/1 4/4 3/3\n"
+    )
+    above = {"transform": {"position": [0, 9, 0.01], "look_at": [0, 0, 0]}, "fov": 40}
+    light = {"type": "point", "transform": {"position": [0, 9000, 0]}, "power": 1e8}
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 2 / slope}
+    flat, bent = (
+        render(tmp_path, [{"type": "mesh", "file": "plate.obj", "bsdf": bsdf}, light], above).color.mean
+        for bsdf in (GREY, {**GREY, "bump": bump})
+    )
+    np.testing.assert_allclose(bent, math.sqrt(0.5) * flat, rtol=1e-3)
+
+
+def test_bent_surfaces_let_light_straight_through_whatever_is_consistent(folder: Path) -> None:
+    write_slope(folder)
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 1000}
+    box = {"type": "cube", "transform": {"position": [0, 0.8, 0]}, "bsdf": {"type": "forward", "bump": bump}}
+    checks = {"type": "path_tracer", "enable_consistency_checks": True}
+    seen = render(folder, [box, WHITE_SKY], {"fov": 15}, integrator=checks)
+    np.testing.assert_allclose(seen.color.mean, 1.0, rtol=1e-6)
+
+
+def test_the_shadow_of_a_bent_film_is_that_of_its_slope(folder: Path) -> None:
+    write_slope(folder)
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 8 / (2 * TEXEL_STEP)}
+    light = {"type": "point", "transform": {"position": [0, 9000, 0]}, "power": 1e8}
+    film = {"type": "quad", "transform": {"position": [-1.5, 1, 0], "scale": [8, 1, 8]}}
+    floor = {"transform": {"position": [0, 0.5, 1], "look_at": [0, 0, 0]}, "fov": 1}
+    direct = {"type": "path_tracer", "max_bounces": 3}
+    free, flat, bent = (
+        render(folder, [FLOOR, *films, light], floor, integrator=direct).color.mean.mean()
+        for films in (
+            [],
+            [{**film, "bsdf": {"type": "thinsheet"}}],
+            [{**film, "bsdf": {"type": "thinsheet", "bump": bump}}],
+        )
+    )
+    through = {}
+    for angle in (0.0, math.pi / 4):
+        cos_i, cos_t = math.cos(angle), math.sqrt(1 - (math.sin(angle) / 1.5) ** 2)
+        r_s = ((cos_i - 1.5 * cos_t) / (cos_i + 1.5 * cos_t)) ** 2
+        r_p = ((cos_t - 1.5 * cos_i) / (cos_t + 1.5 * cos_i)) ** 2
+        through[angle] = 0.5 * ((1 - r_s) / (1 + r_s) + (1 - r_p) / (1 + r_p))
+    assert flat / free == pytest.approx(through[0.0], rel=1e-3)
+    assert bent / free == pytest.approx(through[math.pi / 4], rel=1e-3)
+
+
+def test_a_smooth_mesh_with_a_height_map_is_checked_by_its_bent_normals(folder: Path) -> None:
+    # The vertex normals lean away from the light, by 60 degrees; the slope turns them back, to 15.
+    (folder / "plate.obj").write_text(
+        "v -4 0 -4\nv 4 0 -4\nv 4 0 4\nv -4 0 4\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+        "vn -0.866025 0.5 0\nf 1/1/1 3/3/1 2/2/1\nf 1/1/1 4/4/1 3/3/1\n"
+    )
+    write_slope(folder)
+    bump = {"type": "bitmap", "file": "heights.png", "scale": 0.5 / (2 * TEXEL_STEP)}
+    plate = {"type": "mesh", "file": "plate.obj", "smooth": True, "bsdf": {**GREY, "bump": bump}}
+    above = {"transform": {"position": [0, 5, 0.01], "look_at": [0, 0, 0]}, "fov": 10}
+    light = {"type": "point", "transform": {"position": [9000, 9000, 0]}, "power": 1e9}
+    intensity_over_distance2 = 1e9 / (4 * math.pi) / (2 * 9000**2)
+    for checks in (False, True):
+        integrator = {"type": "path_tracer", "enable_consistency_checks": checks}
+        lit = render(folder, [plate, light], above, integrator=integrator).color.mean
+        expected = 0.5 / math.pi * intensity_over_distance2 * math.cos(math.radians(60))
+        np.testing.assert_allclose(lit, expected, rtol=0.01)
+
+
 # --- Refusals ---------------------------------------------------------------------------------------
 
 
@@ -1044,6 +1122,7 @@ REFUSED: dict[str, Json] = {
         "primitives": [{"type": "infinite_sphere", "emission": {"type": "checker"}}]
     },
     "sun is below the horizon": {"primitives": [{"type": "skydome", "transform": {"rotation": [120, 0, 0]}}]},
+    "skydome of temperature": {"primitives": [{"type": "skydome", "temperature": 20}]},
     "skydome of turbidity": {"primitives": [{"type": "skydome", "turbidity": 11}]},
     "curves of mode ribbon": {"primitives": [{**CURVES, "mode": "ribbon"}]},
     "lambert on curves": {"primitives": [{**CURVES, "mode": "bcsdf_cylinder", "bsdf": GREY}]},
@@ -1114,4 +1193,3 @@ def test_what_is_approximated_is_told(folder: Path, caplog: pytest.LogCaptureFix
     assert len(caplog.messages) == 1
     for part in (str(path), 'bsdf "varnish"', "(mirror)", "--host tungsten"):
         assert part in caplog.messages[0]
-    "skydome of temperature": {"primitives": [{"type": "skydome", "temperature": 20}]},

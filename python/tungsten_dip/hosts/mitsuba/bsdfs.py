@@ -61,9 +61,8 @@ def bsdf_object(
         node = {
             "type": "tungsten_bump",
             "nested": node,
-            "slopes": slopes_node(builder, heights, uv),
+            "slopes": slopes_node(builder, heights),
             "shape": shape,
-            "consistent": builder.source.integrator.enable_consistency_checks,
         }
     built = builder.add("bsdf", node)
     builder.albedo[built.id()] = texture_node(builder, bsdf.written_albedo, "rgb", uv)
@@ -179,8 +178,8 @@ def _rough_conductor(builder: SceneBuilder, bsdf: ts.RoughConductorBsdf, uv: Mat
         "type": "roughconductor",
         "eta": constant(bsdf.eta),
         "k": constant(bsdf.k),
-        **_microfacets(builder, bsdf, uv),
         "specular_reflectance": _albedo(builder, bsdf, uv),
+        **_microfacets(builder, bsdf, uv),
     }
 
 

@@ -87,10 +87,10 @@ def texture_node(
     raise builder.unsupported(f"a texture of type {texture.kind}")
 
 
-def slopes_node(builder: SceneBuilder, texture: Texture, uv: Matrix = UV) -> Node:
+def slopes_node(builder: SceneBuilder, texture: Texture) -> Node:
     """Return the texture of three channels that "tungsten_bump" expects of a height map.
 
-    Between texels Tungsten interpolates their slopes; it repeats every height map and scales each.
+    Tungsten repeats every height map and scales each.
 
     Raises InputError for anything but a bitmap, and for an image that cannot be read.
     """
@@ -99,7 +99,7 @@ def slopes_node(builder: SceneBuilder, texture: Texture, uv: Matrix = UV) -> Nod
     heights = bitmap_pixels(builder, texture, "average")[:, :, 0] * texture.scale
     across, down = (np.roll(heights, -1, axis) - np.roll(heights, 1, axis) for axis in (1, 0))
     slopes = np.stack((across, down, np.zeros_like(heights)), axis=2)
-    return _bitmap_node(slopes, uv, clamp=False, nearest=False)
+    return _bitmap_node(slopes, UV, clamp=False, nearest=True)
 
 
 def is_constant(texture: Texture) -> bool:
