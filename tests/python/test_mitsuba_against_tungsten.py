@@ -145,6 +145,50 @@ def bumpy() -> dict[str, Any]:
     return scene
 
 
+def bent_veils() -> dict[str, Any]:
+    """The room with height maps on what light passes straight through and on a smooth mesh."""
+    scene = changed("integrator", enable_consistency_checks=True)
+    for bsdf in scene["bsdfs"]:
+        if bsdf["name"] in ("veil", "sheet", "red"):
+            bsdf["bump"] = {"type": "bitmap", "file": "heights.png", "scale": 12}
+    place = {"position": [1.6, 0.5, -0.6], "rotation": [30, 40, 10]}
+    scene["primitives"][4] |= {"type": "cube", "transform": place}
+    bowl = {"type": "mesh", "file": "bowl.obj", "smooth": True, "bsdf": "red"}
+    scene["primitives"].append({**bowl, "transform": {"position": [-1.2, 1.2, 0], "scale": 0.5}})
+    return scene
+
+
+def bump_below_0() -> dict[str, Any]:
+    """The room with a height map on a wall whose UV begin below 0 and end above 1."""
+    scene = copy.deepcopy(ROOM)
+    wall = {"type": "lambert", "bump": {"type": "bitmap", "file": "coarse.png", "scale": 3}}
+    scene["primitives"].append({"type": "mesh", "file": "wall.obj", "bsdf": wall})
+    return scene
+
+
+def one_sided() -> dict[str, Any]:
+    """The room with metal and glass that reflects alone, seen from behind, which are not turned."""
+    scene = changed("integrator", enable_two_sided_shading=False)
+    scene["bsdfs"] += [
+        {"name": "copper", "type": "conductor", "material": "Cu"},
+        {"name": "hard", "type": "dielectric", "ior": 1.5, "enable_refraction": False},
+        {"name": "frosted", "type": "rough_dielectric", "roughness": 0.2, "enable_refraction": False},
+        {"name": "both", "type": "mixed", "bsdf0": "frosted", "bsdf1": "red"},
+    ]
+    surfaces = ("copper", "hard", "frosted", "both")
+    for number, (primitive, surface) in enumerate(zip(scene["primitives"][1:5], surfaces, strict=True)):
+        place = {"position": [0.9 * number - 1.5, 0.7, 0], "rotation": [-110, 20, 10], "scale": 0.8}
+        primitive |= {"type": "quad", "bsdf": surface, "transform": place}
+    return scene
+
+
+def in_haze() -> dict[str, Any]:
+    """The room within a medium that only absorbs, through which some rays escape."""
+    scene = changed("camera", medium="haze")
+    scene["media"] = [{"name": "haze", "type": "homogeneous", "sigma_a": [0.1, 0.2, 0.3]}]
+    return scene
+
+
 def outdoors() -> dict[str, Any]:
     """The room without its lamp, under a sky with two suns."""
     scene = copy.deepcopy(ROOM)
@@ -194,6 +238,18 @@ f 3/1/2 4/2/1 5/3/3
 f 4/1/1 1/2/1 5/3/3
 """
 
+WALL = """v -2 0 -1
+v 2 0 -1
+v 2 2 -1
+v -2 2 -1
+vt -1.4 -0.6
+vt 1.2 -0.6
+vt 1.2 1.8
+vt -1.4 1.8
+f 1/1 2/2 3/3
+f 1/1 3/3 4/4
+"""
+
 
 def glazed() -> dict[str, Any]:
     """The room with rough coats over metal and a mirror, and glass that reflects alone."""
@@ -218,6 +274,10 @@ CASES = {
         **bumpy(),
         "integrator": {"type": "path_tracer", "max_bounces": 16, "enable_consistency_checks": True},
     },
+    "bump on veils and a smooth mesh, consistency checks": bent_veils(),
+    "bump beyond UV of 0 to 1": bump_below_0(),
+    "metal and glass that are not turned": one_sided(),
+    "camera in haze": in_haze(),
     "unsampled sun behind a sky": under(
         {"type": "infinite_sphere_cap", "cap_angle": 20, "emission": 9, "sample": False},
         {"type": "infinite_sphere", "emission": 0.5},
@@ -269,17 +329,24 @@ def test_same_picture_up_to_noise(name: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(CASES[name]))
     (tmp_path / "bowl.obj").write_text(BOWL)
+    (tmp_path / "wall.obj").write_text(WALL)
     rows, columns = np.indices((24, 32))
     heights = 128 + 60 * (np.sin(columns * 6 * np.pi / 32) + np.cos(rows * 4 * np.pi / 24))
-    image = OpenImageIO.ImageOutput.create(str(tmp_path / "heights.png"))
-    image.open(str(tmp_path / "heights.png"), OpenImageIO.ImageSpec(32, 24, 1, "uint8"))
-    image.write_image(np.ascontiguousarray(heights[:, :, None], np.uint8))
-    image.close()
+    write_heights(tmp_path / "heights.png", heights)
+    write_heights(tmp_path / "coarse.png", np.random.default_rng(1).integers(0, 256, (3, 4)))
     subprocess.run([Path(str(BUILD)) / "tungsten", path.name], cwd=tmp_path, check=True, capture_output=True)
     theirs = read_buffers(tmp_path)
     ours = render(load_scene(path))
     for quantity in QUANTITIES:
         agree(getattr(ours, quantity), getattr(theirs, quantity), f"{name}: {quantity}")
+
+
+def write_heights(path: Path, heights: np.ndarray) -> None:
+    height, width = heights.shape
+    image = OpenImageIO.ImageOutput.create(str(path))
+    image.open(str(path), OpenImageIO.ImageSpec(width, height, 1, "uint8"))
+    image.write_image(np.ascontiguousarray(heights[:, :, None], np.uint8))
+    image.close()
 
 
 def agree(ours: Buffer, theirs: Buffer, what: str) -> None:
