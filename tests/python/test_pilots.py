@@ -13,7 +13,7 @@ from synthetic import SyntheticRender, buffer_of_halves, relmse, rgb_from_plane,
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import denoise
 from tungsten_dip.fit.layout import Pilot
-from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.maker import PilotMaker, guides_of_colors
 from tungsten_dip.fit.presets import BALANCED_PILOTS
 
 Plane = np.ndarray
@@ -32,7 +32,7 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     halves = _noisy(np.where(surface, 0.03, 0), shape=0.2)
     depth = Buffer(np.where(surface, 2, 0)[:, :, None].astype(np.float32))
     surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves), depth=depth))
-    for image in PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(
+    for image in PilotMaker(halves, surfaces, guides_of_colors(halves, surfaces, 1), 1).images(
         Pilot("guided", 6, step=2, k=1.0)
     ):
         assert image[surface].mean() == pytest.approx(0.03, rel=0.1)
@@ -44,7 +44,7 @@ def test_the_previous_frame_guides_pilots_of_the_color() -> None:
     truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
     halves, previous = _noisy(truth, shape=0.5), (rgb_from_plane(truth), rgb_from_plane(truth))
     surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves)))
-    alone = PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1)
+    alone = PilotMaker(halves, surfaces, guides_of_colors(halves, surfaces, 1), 1)
     guided = replace(alone, previous=previous)
     errors = [
         np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - rgb_from_plane(truth)) ** 2)
@@ -93,7 +93,7 @@ def test_a_pilot_of_the_color_does_without_features(render: SyntheticRender) -> 
         assert color.half_a is not None
         assert color.half_b is not None
         halves, surfaces = (color.half_a, color.half_b), surfaces_of(buffers)
-        return PilotMaker(halves, surfaces, first_guides(halves, surfaces, 1), 1).images(pilot)
+        return PilotMaker(halves, surfaces, guides_of_colors(halves, surfaces, 1), 1).images(pilot)
 
     features = {name: noise(getattr(render.buffers, name)) for name in ("albedo", "normal", "depth")}
     noisy = render.buffers.with_quantities(**features)

@@ -18,7 +18,7 @@ from tungsten_dip.buffers.render_buffers import (
 from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.pilots.maker import PilotMaker, filled_frame, first_guides
+from tungsten_dip.fit.pilots.maker import PilotMaker, filled_frame, guides_of_colors
 from tungsten_dip.fit.pilots.oidn import oidn_pilot
 from tungsten_dip.fit.pilots.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_colors
 from tungsten_dip.fit.preparation.exposure import exposure, scaled
@@ -123,7 +123,7 @@ def evidence_from_buffers(
         layout.check_fits(features_there, len(extra_pilots) + (previous is not None))
 
     occupied = occupied_pixels(halves, buffers, threads)
-    guides = first_guides(halves, surfaces, threads)
+    guides = guides_of_colors(halves, surfaces, threads)
     filled = None
     already_computed: dict[Pilot, Halves] = {}
     if previous is not None:

@@ -23,7 +23,7 @@ from tungsten_dip.buffers.render_buffers import (
 )
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import PILOTS_SHARE, Evidence, occupied_pixels
-from tungsten_dip.fit.pilots.maker import PilotMaker, first_guides
+from tungsten_dip.fit.pilots.maker import PilotMaker, guides_of_colors
 from tungsten_dip.fit.pilots.oidn import oidn_pilot
 from tungsten_dip.fit.pilots.surfaces import surfaces_of_colors
 
@@ -51,7 +51,7 @@ def pilots_of_all_samples(
     colors, threads, noisy = (evidence.mean,), evidence.threads, evidence.candidates.noisy
     surfaces = surfaces_of_colors(buffers, colors, evidence.scale, threads)
     variance = variance_of_mean(noisy)
-    guides = first_guides(colors, surfaces, threads, variance)
+    guides = guides_of_colors(colors, surfaces, threads, variance)
     guides = replace(guides, variance=evidence.guide_variance / np.float32(2))
     maker = PilotMaker(colors, surfaces, guides, threads, variance)
     occupied = occupied_pixels(noisy, buffers, threads)

@@ -52,7 +52,7 @@ class Guides:
     irradiances: tuple[FloatImage, ...]
 
 
-def first_guides(
+def guides_of_colors(
     colors: tuple[FloatImage, ...],
     surfaces: tuple[Surfaces, ...],
     threads: int,
@@ -98,7 +98,7 @@ def filled_frame(
 
 @dataclass
 class PilotMaker:
-    """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `first_guides`.
+    """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `guides_of_colors`.
 
     ``previous``, a `filled_frame`, is the guide of pilots of kind color if given. Others are guided by the
     frame itself: what no feature contains, such as a shadow, may have moved.
@@ -133,7 +133,7 @@ class PilotMaker:
         surfaces = tuple(s.without_features() for s in self.surfaces)
         if self.previous is not None:
             return surfaces, _guides(self.previous, self.colors, surfaces, self.threads)
-        return surfaces, first_guides(self.colors, surfaces, self.threads, self.color_variance)
+        return surfaces, guides_of_colors(self.colors, surfaces, self.threads, self.color_variance)
 
 
 def _guides(
