@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from fitted_models import check_result, short
 from synthetic import SyntheticRender, buffer_of_halves, relmse, synthetic_render
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.fit import FitSettings, denoise
+from tungsten_dip.fit.preparation.exposure import exposure
 
 
 def _halved(color: FloatImage, relative_noise: float, seed: int = 0) -> Buffer:
@@ -93,6 +95,14 @@ def test_what_a_bright_sky_outshines_is_denoised(noise_of_sky: float, darker: fl
     result = denoise(RenderBuffers(buffer_of_halves(a, b), depth=depth), short())
     noisy, denoised = (np.mean((image / darker - 1)[~sky] ** 2) for image in ((a + b) / 2, result.color))
     assert denoised < 0.1 * noisy
+
+
+def test_the_units_of_a_fit_do_not_hang_on_one_pixel(render: SyntheticRender) -> None:
+    """Repaired or written by hand, it may have a mean that is not that of its halves."""
+    color = render.buffers.color
+    mean = color.mean.copy()
+    mean[7, 9] = 1e-30
+    assert exposure(replace(color, mean=mean)) == exposure(color)
 
 
 @pytest.mark.filterwarnings("error")

@@ -1193,3 +1193,10 @@ def test_what_is_approximated_is_told(folder: Path, caplog: pytest.LogCaptureFix
     assert len(caplog.messages) == 1
     for part in (str(path), 'bsdf "varnish"', "(mirror)", "--host tungsten"):
         assert part in caplog.messages[0]
+
+
+def test_a_mixed_bsdf_may_be_all_that_a_scene_has(tmp_path: Path) -> None:
+    mixed = {"type": "mixed", "bsdf0": {"type": "mirror"}, "bsdf1": GREY}
+    quad = {"type": "quad", "bsdf": mixed}
+    scene = loaded(tmp_path, [quad], integrator={"type": "path_tracer", "enable_two_sided_shading": False})
+    assert len(scene.shapes()) == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -37,20 +36,6 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
     ):
         assert image[surface].mean() == pytest.approx(0.03, rel=0.1)
         assert image[~surface].max() < 1e-6
-
-
-def test_the_previous_frame_guides_pilots_of_the_color() -> None:
-    """It shows stripes of shadow that the noise hides."""
-    truth = np.where(np.indices((36, 48))[1] // 4 % 2, 0.4, 0.1)
-    halves, previous = _noisy(truth, shape=0.5), (rgb_from_plane(truth), rgb_from_plane(truth))
-    surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves)))
-    alone = PilotMaker(halves, surfaces, guides_of_colors(halves, surfaces, 1), 1)
-    guided = replace(alone, previous=previous)
-    errors = [
-        np.mean((maker.images(Pilot("color", 4, k=1.0))[0] - rgb_from_plane(truth)) ** 2)
-        for maker in (alone, guided)
-    ]
-    assert errors[1] < 0.5 * errors[0]
 
 
 @pytest.mark.parametrize(

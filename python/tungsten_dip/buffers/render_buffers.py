@@ -109,10 +109,6 @@ class Buffer:
         """Both halves, or the mean in place of either."""
         return self.halves or (self.mean, self.mean)
 
-    def images(self, count: int) -> tuple[FloatImage, ...]:
-        """Return what belongs to each of ``count`` colours: to two halves both, to one colour the mean."""
-        return self.halves_or_mean if count == 2 else (self.mean,)
-
     def planes(self) -> Iterator[tuple[str, FloatImage]]:
         """Yield (name, array) for every array that is known, in the order of the fields."""
         for plane in fields(self):

@@ -48,8 +48,8 @@ def fit_blend(
     further, not if a new one is fitted.
 
     ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
-    the shape of the colour, NaN where they have no value. They are an extra pilot and a guide, with which
-    fewer pilots are needed.
+    the shape of the colour, NaN where they have no value. They are an extra pilot, with which fewer
+    others are needed.
 
     Ctrl-C during the training or after it ends the fit early. The pilots of all samples are then used if they
     are complete, else given up: the image is made of the halves alone.
@@ -161,8 +161,9 @@ class _AllSamplesPilots:
             return self.result()
         except KeyboardInterrupt:
             self.give_up()
-            training.interrupted = True
-            training.notes.append(f"interrupted after the training of {training.steps_done} steps")
+            if not training.interrupted:
+                training.interrupted = True
+                training.notes.append(f"interrupted after the training of {training.steps_done} steps")
             return self.result()
 
 

@@ -18,22 +18,19 @@ from tungsten_dip.buffers.render_buffers import (
 from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.layout import Layout, Pilot
-from tungsten_dip.fit.pilots.maker import PilotMaker, filled_frame, guides_of_colors
+from tungsten_dip.fit.pilots.maker import PilotMaker, guides_of_colors
 from tungsten_dip.fit.pilots.oidn import oidn_pilot
 from tungsten_dip.fit.pilots.surfaces import Surfaces, alpha_as_albedo, emission_of_halves, surfaces_of_colors
 from tungsten_dip.fit.preparation.exposure import exposure, scaled
 from tungsten_dip.fit.preparation.fireflies import Limited, limit_fireflies
 from tungsten_dip.fit.preparation.splitting import HalvedImage
-from tungsten_dip.fit.presets import DRAFT_PILOTS, FOLLOWING_PILOTS
+from tungsten_dip.fit.presets import DRAFT_PILOTS
 from tungsten_dip.fit.scoring.measure import ErrorMeasure, best_candidate, error_measure
 from tungsten_dip.fit.stages import stage
 from tungsten_dip.progress import Progress
 
 _NEAR_RADIUS = 2
 """Radius of the window in which no sample may have hit anything, for a pixel to be empty space."""
-
-_LAMP_RADIUS = 8
-"""Radius of the window in which a lamp leaves no pixel unlit."""
 
 PILOTS_SHARE = 0.45
 _DRAFT_SHARE = 0.7
@@ -44,8 +41,7 @@ _DRAFT_SHARE = 0.7
 class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``unlit``, shape (height, width, 1), is 1 in pixels that
-    have no lamp in the 17x17 pixels around, else 0. ``guide_variance`` is that of the pilots' guides (see
+    ``mean`` is the noisy image, without fireflies. ``guide_variance`` is that of the pilots' guides (see
     `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`). ``halves_drawn``
     and ``notes`` are those of the result (`FitResult`).
     """
@@ -54,7 +50,6 @@ class Evidence:
     mean: FloatImage
     layout: Layout
     candidates: Candidates
-    unlit: FloatImage
     guide_variance: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
@@ -102,7 +97,7 @@ def evidence_from_buffers(
 
     ``plan`` is the pilots, or the layout of a fitted network, whose pilots are all computed. Extra pilots are
     the image of Open Image Denoise, if ``with_oidn``, and the ``previous`` frame: halves of a result, NaN
-    where they have no value, that guide the pilots as well.
+    where they have no value, which the first pilot fills.
 
     Raises InputError if the layout has a feature that is missing or another number of extra pilots.
     """
@@ -124,18 +119,11 @@ def evidence_from_buffers(
 
     occupied = occupied_pixels(halves, buffers, threads)
     guides = guides_of_colors(halves, surfaces, threads)
-    filled = None
-    already_computed: dict[Pilot, Halves] = {}
-    if previous is not None:
-        filler, filled = filled_frame(
-            halves, _scaled_halves(previous, scale), surfaces, FOLLOWING_PILOTS[0], threads
-        )
-        already_computed = {FOLLOWING_PILOTS[0]: _masked(filler, occupied)}
-        filled = _masked(filled, occupied)
-        extra_pilots.append(filled)
-    maker = PilotMaker(halves, surfaces, guides, threads, previous=filled)
+    maker = PilotMaker(halves, surfaces, guides, threads)
     budget = clock if layout is None else Clock()
-    computed = _computed(maker, pilots, already_computed, occupied, budget, stage(progress, "pilots"))
+    computed = _computed(maker, pilots, occupied, budget, stage(progress, "pilots"))
+    if previous is not None:
+        extra_pilots.append(_filled(previous, scale, computed[0], occupied))
 
     candidates = Candidates(halves, tuple(computed), tuple(extra_pilots))
     measure = error_measure(candidates, threads)
@@ -148,7 +136,6 @@ def evidence_from_buffers(
         mean=mean,
         layout=layout,
         candidates=candidates,
-        unlit=_unlit_pixels(surfaces, threads),
         guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
@@ -164,12 +151,7 @@ def evidence_from_buffers(
 
 
 def _computed(
-    maker: PilotMaker,
-    pilots: Sequence[Pilot],
-    already_computed: dict[Pilot, Halves],
-    occupied: FloatImage,
-    clock: Clock,
-    progress: Progress,
+    maker: PilotMaker, pilots: Sequence[Pilot], occupied: FloatImage, clock: Clock, progress: Progress
 ) -> list[Halves]:
     """Return all pilots, but those that the time budget does not allow any more; the first it always does."""
     computed: list[Halves] = []
@@ -178,9 +160,18 @@ def _computed(
         share = _DRAFT_SHARE if pilot in DRAFT_PILOTS else PILOTS_SHARE
         if index > 0 and clock.share_spent() > share:
             break
-        images = already_computed.get(pilot)
-        computed.append(images or _masked(maker.images(pilot), occupied))
+        a, b = maker.images(pilot)
+        computed.append((a * occupied, b * occupied))
     return computed
+
+
+def _filled(previous: Halves, scale: float, instead: Halves, occupied: FloatImage) -> Halves:
+    """Return linear radiance in the units of the evidence, from a pilot ``instead`` where it has no value."""
+    a, b = (
+        np.where(np.isfinite(image), np.maximum(scaled(image, scale), 0) * occupied, pilot)
+        for image, pilot in zip(previous, instead, strict=True)
+    )
+    return a, b
 
 
 def _without_fireflies(image: HalvedImage, scale: float, threads: int) -> tuple[FloatImage, Limited]:
@@ -193,17 +184,6 @@ def _without_fireflies(image: HalvedImage, scale: float, threads: int) -> tuple[
     if limited.gain is None:
         return scaled(color.mean, scale), limited
     return mean_of(limited.halves), limited
-
-
-def _masked(images: Sequence[FloatImage], occupied: FloatImage) -> Halves:
-    a, b = images
-    return a * occupied, b * occupied
-
-
-def _scaled_halves(halves: Halves, scale: float) -> Halves:
-    """Return linear radiance in the units of the evidence."""
-    a, b = (np.maximum(scaled(half, scale), 0) for half in halves)
-    return a, b
 
 
 def with_best_baseline(evidence: Evidence, cues: Cues) -> tuple[Evidence, Cues]:
@@ -232,12 +212,6 @@ def occupied_pixels(halves: Halves, buffers: RenderBuffers, threads: int) -> Flo
     hit = (buffers.depth.mean > 0) | (halves[0] + halves[1] > 0).any(axis=2, keepdims=True)
     near = _core.box_mean(hit.astype(np.float32), _NEAR_RADIUS, threads) > 0
     return near.astype(np.float32)
-
-
-def _unlit_pixels(surfaces: Sequence[Surfaces], threads: int) -> FloatImage:
-    emits = np.any([(s.emission > 0).any(axis=2, keepdims=True) for s in surfaces], axis=0)
-    near = _core.box_mean(emits.astype(np.float32), _LAMP_RADIUS, threads) > 0
-    return (~near).astype(np.float32)
 
 
 def _notes_on_features(buffers: RenderBuffers) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tungsten_dip.buffers.atomic import check_suffix
 from tungsten_dip.buffers.render_buffers import FloatImage, RenderBuffers, as_float32, check_array
 from tungsten_dip.buffers.source import Channel
 from tungsten_dip.buffers.write import write_layers
@@ -36,6 +37,7 @@ def write_denoised(
     """
     check_type("result", result, FitResult, "give what denoise returned, not its image alone")
     check_type("buffers", buffers, RenderBuffers, "give those that the result was made from")
+    check_suffix(Path(path), ".exr")
     layers = {"": _stored("the picture", _checked("color", result.color, buffers, 3), float16)}
     if result.error is not None:
         layers["error"] = _stored("the error", _checked("error", result.error, buffers, 1), float16)

@@ -19,22 +19,31 @@ _STANDARD_ERRORS = 3.0
 
 _LARGEST_GAIN = 1.25
 
+_LAMP = 16.0
+"""Pixels more than so many times brighter than is typical around them are lamps or highlights."""
 
-def gain_of_lost_light(noisy: Halves, image: FloatImage, unlit: FloatImage, threads: int) -> FloatImage:
-    """Return what the image is to be multiplied by, shape (height, width, 1), from 1 to 1.25.
+_BLACK = 2e-3
+"""Added to levels before their logarithm; the median of lit pixels is about 0.25."""
 
-    ``noisy`` are the noisy halves, linear radiance like the image. The mean that is missing from it in the
-    49x49 pixels around, as far as it is statistically certain, is relative to the image's own. Only pixels
-    that are ``unlit`` (1, else 0; shape (height, width, 1)) count and gain: at the rims of lamps more is lost
-    than their surroundings may get.
+
+def gain_of_lost_light(noisy: Halves, image: FloatImage, threads: int) -> FloatImage:
+    """Return what an image is to be multiplied by, shape (height, width, 1), from 1 to 1.25.
+
+    ``noisy`` are the noisy halves, linear radiance in the units of `evidence.Evidence`, shape (height, width,
+    3) like the image. The gain gives back what is missing from the image's mean over 49x49 pixels, as far as
+    it is statistically certain. Lamps neither count nor gain, and no pixel may miss more than is typical
+    around it (the geometric mean): what a lamp and its rim lost must not go to the dark around them.
     """
 
-    def total(values: FloatImage) -> FloatImage:
-        return _core.box_mean(values * unlit, _RADIUS, threads) * window_pixels(image.shape, _RADIUS)
+    def mean(values: FloatImage) -> FloatImage:
+        return _core.box_mean(values, _RADIUS, threads)
 
-    missing = total(channel_mean(mean_of(noisy) - image))
-    variance = np.maximum(total(channel_mean(variance_of_mean(noisy))), 0)
-    certain = np.maximum(missing - np.float32(_STANDARD_ERRORS) * np.sqrt(variance), 0)
-    gain = certain / np.maximum(total(channel_mean(image)), np.float32(1e-15))
-    bounded: FloatImage = 1 + np.minimum(gain, np.float32(_LARGEST_GAIN - 1)) * unlit
-    return bounded
+    level = channel_mean(image)
+    typical = np.exp(mean(np.log(level + np.float32(_BLACK))))
+    counted = level <= np.float32(_LAMP) * typical
+    missing = np.clip(channel_mean(mean_of(noisy)) - level, -typical, typical) * counted
+    variance = mean(channel_mean(variance_of_mean(noisy)) * counted)
+    error = np.sqrt(np.maximum(variance, 0) / window_pixels(image.shape, _RADIUS))
+    certain = np.maximum(mean(missing) - np.float32(_STANDARD_ERRORS) * error, 0)
+    gain = 1 + certain / np.maximum(mean(level * counted), np.float32(1e-15))
+    return np.where(counted, np.minimum(gain, np.float32(_LARGEST_GAIN)), np.float32(1))

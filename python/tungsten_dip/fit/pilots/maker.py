@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.render_buffers import FloatImage, Halves
+from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots.surfaces import Surfaces, along_edges
 
@@ -36,7 +36,7 @@ _FIRST_GUIDE_WITHOUT_FEATURES = Pilot("features", 1)
 """Without features, a window blurs every edge within it."""
 
 _SECOND_GUIDE = Pilot("guided", 8, step=2, k=1.0)
-"""Guided by the first, it is the guide of all pilots."""
+"""Guided by the first, it is the guide of pilots."""
 
 
 @dataclass(frozen=True)
@@ -77,39 +77,15 @@ def guides_of_colors(
     return _guides(smooth, irradiances, surfaces, threads, color_variance)
 
 
-def filled_frame(
-    colors: Halves, previous: Halves, surfaces: tuple[Surfaces, ...], filler: Pilot, threads: int
-) -> tuple[Halves, Halves]:
-    """Return the images of the pilot ``filler``, and a previous frame that they fill where it has no value.
-
-    ``previous`` are the halves of its result, reprojected to this frame, NaN where they have no value. All
-    are linear radiance in the units of the colours.
-    """
-    filler_a, filler_b = (
-        s.color(_regress(s.irradiance(color), filler, s, threads))
-        for color, s in zip(colors, surfaces, strict=True)
-    )
-    filled_a, filled_b = (
-        np.where(np.isfinite(image), np.maximum(image, 0), instead).astype(np.float32)
-        for image, instead in zip(previous, (filler_a, filler_b), strict=True)
-    )
-    return (filler_a, filler_b), (filled_a, filled_b)
-
-
 @dataclass
 class PilotMaker:
-    """Computes the pilots of both halves, or of the mean alone; ``color_variance`` as in `guides_of_colors`.
-
-    ``previous``, a `filled_frame`, is the guide of pilots of kind color if given. Others are guided by the
-    frame itself: what no feature contains, such as a shadow, may have moved.
-    """
+    """Computes the pilots of the two halves, or of the mean alone with the ``color_variance`` of its noise."""
 
     colors: tuple[FloatImage, ...]
     surfaces: tuple[Surfaces, ...]
     guides: Guides
     threads: int
     color_variance: FloatImage | None = None
-    previous: Halves | None = None
 
     def images(self, pilot: Pilot) -> tuple[FloatImage, ...]:
         """Return linear radiance, shape (height, width, 3), never negative, one image for each colour."""
@@ -131,8 +107,6 @@ class PilotMaker:
     @cached_property
     def _of_color(self) -> tuple[tuple[Surfaces, ...], Guides]:
         surfaces = tuple(s.without_features() for s in self.surfaces)
-        if self.previous is not None:
-            return surfaces, _guides(self.previous, self.colors, surfaces, self.threads)
         return surfaces, guides_of_colors(self.colors, surfaces, self.threads, self.color_variance)
 
 

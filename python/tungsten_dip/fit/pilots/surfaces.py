@@ -143,19 +143,17 @@ def surfaces_of_colors(
         buffers = replace(buffers, albedo=_with_planes(rendered, bounded))
     filtered = prefilter_features(buffers, threads)
     depth_scale = _depth_scale(filtered)
+    images = {
+        name: images_for(colors, feature) for name in FEATURES if (feature := filtered.get(name)) is not None
+    }
     features = [
-        {
-            name: images_for(colors, feature)[index]
-            for name in FEATURES
-            if (feature := filtered.get(name)) is not None
-        }
-        for index in range(len(colors))
+        {name: of_colors[index] for name, of_colors in images.items()} for index in range(len(colors))
     ]
-    channels = [_channels(images, depth_scale, of_alpha=alpha is not None) for images in features]
+    channels = [_channels(of_color, depth_scale, of_alpha=alpha is not None) for of_color in features]
     flat = [name for name in channels[0] if all(of_color[name].flat for of_color in channels)]
     return tuple(
-        _surfaces(of_color, flat, albedo, images.get("albedo"), color.shape, scale, threads)
-        for of_color, albedo, images, color in zip(channels, albedos, features, colors, strict=True)
+        _surfaces(of_color, flat, albedo, filtered_images.get("albedo"), color.shape, scale, threads)
+        for of_color, albedo, filtered_images, color in zip(channels, albedos, features, colors, strict=True)
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage
 
@@ -19,20 +20,26 @@ def exposure(color: Buffer) -> float:
     Pixels count by their noise, the relative difference of their halves, if there are halves: a clear sky has
     none to remove, and what it outshines must not be as if it were black.
     """
-    level = color.mean.mean(axis=2, dtype=np.float64)
+    level = _mean(color.mean)
     lit = level > 0
     if not lit.any():
         return 1.0
     half_a, half_b = color.halves_or_mean
-    apart = np.abs(half_a - half_b).mean(axis=2, dtype=np.float64)
-    weight = apart[lit] / level[lit]
+    # True halves differ by no more than twice their mean.
+    weight = np.minimum(np.abs(_mean(half_a) - _mean(half_b))[lit] / level[lit], 2)
     if not weight.any():
         weight = np.ones_like(weight)
-    order = np.argsort(level[lit])
-    reached = np.cumsum(weight[order])
-    median = level[lit][order][np.searchsorted(reached, reached[-1] / 2)]
-    # Powers that float32 can hold.
-    return float(2.0 ** np.clip(np.round(np.log2(_TYPICAL_RADIANCE / median)), -126, 126))
+    # The power of two of each pixel's own level, up to what float32 can hold.
+    powers = np.clip(np.round(np.log2(_TYPICAL_RADIANCE / level[lit])), -126, 126).astype(np.int64)
+    reached = np.bincount(powers + 126, weight).cumsum()
+    return float(2.0 ** (np.searchsorted(reached, reached[-1] / 2) - 126))
+
+
+def _mean(image: FloatImage) -> npt.NDArray[np.float64]:
+    """Return the mean over the channels, shape (height, width), which cannot overflow."""
+    red, green, blue = (image[:, :, channel].astype(np.float64) for channel in range(3))
+    mean: npt.NDArray[np.float64] = (red + green + blue) / 3
+    return mean
 
 
 def scaled(image: FloatImage, scale: float) -> FloatImage:

@@ -44,7 +44,8 @@ class SceneBuilder:
 
     def add(self, kind: str, node: Any) -> Any:
         """Add the object that a node describes (or the object) to the scene under its id, and return it."""
-        name = f"{kind}_{len(self.scene)}"
+        # Without the underscore that names of children have: Mitsuba takes the same for a conflict.
+        name = f"{kind}{len(self.scene)}"
         self.scene[name] = built = load({**node, "id": name}) if isinstance(node, dict) else node
         return built
 
