@@ -79,7 +79,7 @@ def guides_of_colors(
 
 @dataclass
 class PilotMaker:
-    """Computes the pilots of the two halves, or of the mean alone with the ``color_variance`` of its noise."""
+    """Computes pilots of the two halves, or of the mean alone with the ``color_variance`` of its noise."""
 
     colors: tuple[FloatImage, ...]
     surfaces: tuple[Surfaces, ...]
