@@ -188,7 +188,8 @@ NormAct norm_from_arrays(const Numbers& x, const Array& weight, const Array& bia
     if (x.ndim() != 2 || x.shape(1) == 0 || x.shape(0) == 0 || weight.size() != x.shape(1) ||
         bias.size() != x.shape(1)) {
         throw py::value_error(
-            "x, weight, bias: expected shape (pixels, channels) without a 0, and one weight and bias for each "
+            "x, weight, bias: expected shape (pixels, channels) without a 0, and one weight and bias for "
+            "each "
             "channel, got " +
             described(x) + ", " + described(weight) + ", " + described(bias));
     }
