@@ -606,10 +606,12 @@ def test_a_cut_is_told_by_what_is_in_sight(tmp_path):
     assert follower.denoise(now.buffers, now.camera).how == "cut"
 
 
-def test_a_cut_is_told_by_another_size_and_by_the_error(tmp_path):
+def test_a_cut_is_told_by_another_size_and_by_the_error(caplog):
+    caplog.set_level("INFO", logger="tungsten_dip")
     follower = Follower(DRAFT, 0)
     follower.denoise(synthetic_render(spp=4096).buffers)
     assert follower.denoise(synthetic_render(spp=2, seed=1).buffers).how == "cut"
+    assert "a cut: the error, relative to radiance^2 + 0.01, is" in caplog.text
     assert follower.denoise(synthetic_render(20, 30).buffers).how == "cut"
 
 

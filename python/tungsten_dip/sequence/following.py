@@ -197,7 +197,10 @@ class Follower:
         if result.interrupted:
             error = None  # of a fit that was cut short
         if error is not None and self._error is not None and error > _CUT_ERROR * self._error:
-            raise _CutError(f"the error is {error / self._error:.1f} times that of the last frame with noise")
+            raise _CutError(
+                f"the error, relative to radiance^2 + 0.01, is {error / self._error:.1f} times that of the "
+                "last frame with noise"
+            )
         kept = result.model or model
         if moved is None:
             self.models = replace(self.models, alone=kept)
