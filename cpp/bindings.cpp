@@ -261,6 +261,8 @@ PYBIND11_MODULE(_core, module) {
     py::class_<HalvesTest>(module, "HalvesTest")
         .def(py::init<>())
         .def_readonly("correlation", &HalvesTest::correlation)
+        .def_readonly("variance_ratio", &HalvesTest::variance_ratio)
+        .def_readonly("variance_fits", &HalvesTest::variance_fits)
         .def_readonly("independent", &HalvesTest::independent);
 
     module.def("sanitize", &sanitize, py::arg("quantity"), py::arg("mean"), py::arg("half_a"),

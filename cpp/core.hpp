@@ -136,7 +136,11 @@ void halves_variance(ConstImage half_a, ConstImage half_b, Image out, int thread
 struct HalvesTest {
     // Of the two halves' errors; NaN if this image does not allow measuring it.
     double correlation = std::numeric_limits<double>::quiet_NaN();
-    bool independent = false;  // false as well where the correlation is NaN
+    // Of the variance that the halves show to the one that is given; NaN without the latter, or if its digits
+    // are too few.
+    double variance_ratio = std::numeric_limits<double>::quiet_NaN();
+    bool variance_fits = true;  // false if these are variances of different things
+    bool independent = false;   // false as well where the correlation is NaN
 };
 // `variance` is that of the mean, by the samples; it may be unknown.
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,

@@ -33,12 +33,18 @@ class HalvesTest:
     """Whether the noise of two half buffers is independent. Without arguments: nothing is known.
 
     ``correlation`` is that of the halves' errors, NaN if the image does not allow measuring it. Then
-    ``independent`` is False as well.
+    ``independent`` is False as well. ``variance_ratio`` is that of the variance that the halves show to the
+    given one, NaN if it is not known, and ``variance_fits`` is False if these are variances of different
+    things.
     """
 
     def __init__(self) -> None: ...
     @property
     def correlation(self) -> float: ...
+    @property
+    def variance_ratio(self) -> float: ...
+    @property
+    def variance_fits(self) -> bool: ...
     @property
     def independent(self) -> bool: ...
 
@@ -58,7 +64,7 @@ def sanitize(
 def compare_halves(
     half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int
 ) -> HalvesTest:
-    """Test the halves of a colour for independence."""
+    """Test the halves of a colour for independence, and its variance."""
 
 def prefilter_feature(
     mean: FloatImage,

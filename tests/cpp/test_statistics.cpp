@@ -84,6 +84,26 @@ void shared_samples_fail() {
     }
 }
 
+// A variance of one sample is as many times too large as there are samples.
+void foreign_variances_are_found() {
+    for (const auto& render : {Render(100, 99, 16, 3, normal), Render(100, 99, 16, 4, firefly),
+                               Render(100, 99, 16, 6, mirrored(-0.5))}) {
+        for (const double factor : {1.0 / 16, 1.0, 2.0, 16.0}) {
+            Render scaled = render;
+            for (float& value : scaled.variance.values) value *= static_cast<float>(factor);
+            const HalvesTest test = compare(scaled, true);
+            CHECK_NEAR(test.variance_ratio * factor, compare(scaled, false).correlation > 0.3 ? 0.5 : 1, 0.1);
+            CHECK(test.variance_fits == (factor == 1 || factor == 2));
+        }
+    }
+    // Halves that are nearly the same tell of their shared samples, not of the variance.
+    Render same(100, 99, 16, 7, mirrored(-0.95));
+    CHECK(compare(same, true).variance_ratio < 0.2);
+    CHECK(compare(same, true).variance_fits);
+    CHECK(std::isnan(compare(same, false).variance_ratio));
+    CHECK(compare(same, false).variance_fits);
+}
+
 // Few tiles tell the correlation badly: what chance explains is no evidence.
 void few_pixels_accuse_nobody() {
     for (unsigned seed = 20; seed < 60; ++seed) {
@@ -179,6 +199,7 @@ int main() {
     independent_halves_pass();
     mirrored_halves_fail();
     shared_samples_fail();
+    foreign_variances_are_found();
     few_pixels_accuse_nobody();
     texture_is_no_correlation();
     textured_tiles_are_left_aside();

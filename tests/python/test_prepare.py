@@ -127,3 +127,20 @@ def test_an_albedo_that_may_be_in_its_scale_is_used(
     color, feature = (Buffer(np.full((1, 1, 3), value, np.float32)) for value in (radiance, albedo))
     assert prepare_input(RenderBuffers(color, feature), 1).buffers.albedo is not None
     assert "albedo" not in caplog.text
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(16, False), (1 / 16, False), (2, True), (1, True)])
+def test_a_variance_that_the_halves_contradict_is_left_out(
+    factor: float, kept: bool, render: SyntheticRender
+) -> None:
+    color = render.buffers.color
+    changed = replace(color, variance=color.variance * np.float32(factor))
+    prepared = prepare_input(render.buffers.with_quantities(color=changed), 1)
+    assert (prepared.buffers.color.variance is not None) == kept
+    told = [float(note.split(" got ")[1].split(" times")[0]) for note in prepared.notes if "variance" in note]
+    assert told == ([] if kept else [pytest.approx(factor, rel=0.2)])
+    # Copies show nothing of the noise, and without halves nothing does.
+    for halves in ((color.mean, color.mean.copy()), (None, None)):
+        alone = Buffer(color.mean, *halves, changed.variance)
+        prepared = prepare_input(render.buffers.with_quantities(color=alone), 1)
+        assert prepared.buffers.color.variance is not None

@@ -1,4 +1,4 @@
-"""Checks that half buffers are halves of the image's samples, with independent noise."""
+"""Checks that half buffers are halves of the image's samples, with independent noise, as its variance is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from tungsten_dip._core import HalvesTest
 from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, RenderBuffers
 from tungsten_dip.cores import thread_count
 
-__all__ = ["HalvesTest", "compare_halves", "without_foreign_halves", "without_single_halves"]
+__all__ = [
+    "HalvesTest",
+    "compare_halves",
+    "without_foreign_halves",
+    "without_foreign_variance",
+    "without_single_halves",
+]
 
 _UNEQUAL = 0.5
 """How far a pixel may lie from (A + B) / 2, over |A - B| / 2. Halves of one and of two samples give 1/3."""
@@ -78,6 +84,26 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
         for name in alone
     )
     return buffers.with_quantities(**alone), lines
+
+
+def without_foreign_variance(
+    buffers: RenderBuffers, threads: int | None = None
+) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return buffers without a variance of the colour that its halves contradict, and a line on it.
+
+    It is that of one sample, say, or of another unit. Expects sanitised buffers.
+    """
+    color = buffers.color
+    if color.variance is None:
+        return buffers, ()
+    test = compare_halves(buffers, threads)
+    if test.variance_fits:
+        return buffers, ()
+    line = (
+        "color: the variance is not used: expected that of the mean of all samples, as the half buffers show "
+        f"it, got {1 / test.variance_ratio:.3g} times that; divide the variance of one sample by their number"
+    )
+    return buffers.with_quantities(color=replace(color, variance=None)), (line,)
 
 
 def _halves_belong(buffer: Buffer) -> bool:

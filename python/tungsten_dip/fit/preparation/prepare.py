@@ -9,7 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from tungsten_dip import _core
-from tungsten_dip.buffers.half_buffers import without_foreign_halves, without_single_halves
+from tungsten_dip.buffers.half_buffers import (
+    without_foreign_halves,
+    without_foreign_variance,
+    without_single_halves,
+)
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
 from tungsten_dip.buffers.sanitize import sanitize
 from tungsten_dip.cores import thread_count
@@ -39,7 +43,9 @@ class Prepared:
 
 
 def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
-    """Check and sanitise the input, without an albedo in another scale, with halves for those that are lost.
+    """Check and sanitise the input.
+
+    An albedo in another scale and a variance of something else are left out, halves that are lost are drawn.
 
     Raises InputError if these are no buffers or the image is empty.
     """
@@ -56,7 +62,8 @@ def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
     buffers, lost = _without_lost_halves(buffers, rendered, thread_count(threads))
-    return Prepared(buffers, (*single, *foreign, *repaired, *lost))
+    buffers, variance = without_foreign_variance(buffers, threads)
+    return Prepared(buffers, (*single, *foreign, *repaired, *lost, *variance))
 
 
 def _without_lost_halves(
