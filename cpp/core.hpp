@@ -142,7 +142,7 @@ struct HalvesTest {
     bool variance_fits = true;  // false if these are variances of different things
     bool independent = false;   // false as well where the correlation is NaN
 };
-// `variance` is that of the mean, by the samples; it may be unknown.
+// `variance` is that of the mean, by the samples; it may be unknown. NaN in the halves is left out.
 [[nodiscard]] HalvesTest compare_halves(ConstImage half_a, ConstImage half_b, ConstImage variance,
                                         int threads);
 

@@ -37,7 +37,7 @@ struct Tile {
     double sum = 0;         // S
     double difference = 0;  // D
     double energy = 0;      // of A + B itself
-    int pixels = 0;
+    int values = 0;
 
     [[nodiscard]] double correlation() const { return (sum - difference) / (sum + difference); }
     [[nodiscard]] double calmness() const { return (sum + difference) / energy; }
@@ -59,12 +59,13 @@ Tile measure_tile(ConstImage a, ConstImage b, int top, int left) {
                         high_b += weight * b.at(row, column, c);
                     }
                 }
+                if (std::isnan(high_a + high_b)) continue;
                 const double total = static_cast<double>(a.at(y, x, c)) + b.at(y, x, c);
                 tile.sum += (high_a + high_b) * (high_a + high_b);
                 tile.difference += (high_a - high_b) * (high_a - high_b);
                 tile.energy += total * total;
+                ++tile.values;
             }
-            ++tile.pixels;
         }
     }
     return tile;
@@ -92,8 +93,9 @@ Correlation measure_correlation(ConstImage a, ConstImage b, int threads) {
                 measure_tile(a, b, 1 + row * tile_size, 1 + column * tile_size);
         }
     });
-    // Slivers at the borders hold too few pixels for a ratio.
-    std::erase_if(tiles, [](const Tile& tile) { return tile.pixels < tile_size * tile_size / 2; });
+    // Slivers at the borders, and tiles full of unknown values, hold too few for a ratio.
+    const int enough = tile_size * tile_size / 2 * a.channels;
+    std::erase_if(tiles, [enough](const Tile& tile) { return tile.values < enough; });
 
     const bool signal = std::ranges::any_of(tiles, [](const Tile& tile) { return tile.sum > 0; });
     std::erase_if(tiles, [](const Tile& tile) { return !(tile.difference > rounding * tile.energy); });

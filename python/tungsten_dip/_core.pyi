@@ -64,7 +64,7 @@ def sanitize(
 def compare_halves(
     half_a: FloatImage, half_b: FloatImage, variance: FloatImage | None, threads: int
 ) -> HalvesTest:
-    """Test the halves of a colour for independence, and its variance."""
+    """Test the halves of a colour for independence, and its variance; NaN in the halves is left out."""
 
 def prefilter_feature(
     mean: FloatImage,

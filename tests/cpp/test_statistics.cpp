@@ -1,5 +1,6 @@
 // Statistics against analytic values, and the test of independence against samplers whose answer is known.
 #include <cmath>
+#include <limits>
 #include <random>
 #include <utility>
 
@@ -104,6 +105,22 @@ void foreign_variances_are_found() {
     CHECK(compare(same, false).variance_fits);
 }
 
+void unknown_values_are_left_out() {
+    Render render(100, 99, 16, 8, mirrored(0.4));
+    const HalvesTest all = compare(render, true);
+    for (int y = 0; y < 30; ++y) {
+        for (int x = 0; x < 99; ++x) render.half_a.at(y, x) = std::numeric_limits<float>::quiet_NaN();
+    }
+    const HalvesTest most = compare(render, true);
+    CHECK_NEAR(most.correlation, all.correlation, 0.1);
+    CHECK_NEAR(most.variance_ratio, all.variance_ratio, 0.1);
+    CHECK(!most.independent);
+    for (int y = 0; y < 100; ++y) {
+        for (int x = y % 2; x < 99; x += 2) render.half_b.at(y, x) = std::numeric_limits<float>::quiet_NaN();
+    }
+    CHECK(std::isnan(compare(render, true).correlation));
+}
+
 // Few tiles tell the correlation badly: what chance explains is no evidence.
 void few_pixels_accuse_nobody() {
     for (unsigned seed = 20; seed < 60; ++seed) {
@@ -200,6 +217,7 @@ int main() {
     mirrored_halves_fail();
     shared_samples_fail();
     foreign_variances_are_found();
+    unknown_values_are_left_out();
     few_pixels_accuse_nobody();
     texture_is_no_correlation();
     textured_tiles_are_left_aside();

@@ -129,6 +129,43 @@ def test_an_albedo_that_may_be_in_its_scale_is_used(
     assert "albedo" not in caplog.text
 
 
+def test_gaps_between_samples_are_filled(render: SyntheticRender) -> None:
+    """Every other pixel has no sample, and what a renderer leaves there is black."""
+    spp = np.indices((40, 56, 1)).sum(axis=0).astype(np.float32) % 2 * 16
+    planes = {
+        name: Buffer(**{plane: image * (spp > 0) for plane, image in buffer.planes()})
+        for name, buffer in render.buffers.quantities()
+    }
+    buffers = replace(render.buffers.with_quantities(**planes), spp=spp, alpha=(spp > 0).astype(np.float32))
+    result = denoise(buffers, short())
+    assert not result.halves_drawn
+    assert [note for note in result.notes if "1120 of 2240 pixels have no sample" in note]
+    assert result.color.mean() == pytest.approx(render.reference.mean(), rel=0.05)
+    sampled = spp[..., 0] > 0
+    error = relmse(result.color[sampled], render.reference[sampled])
+    assert error < relmse(render.buffers.color.mean[sampled], render.reference[sampled]) / 3
+    prepared = prepare_input(buffers, 1).buffers
+    np.testing.assert_allclose(prepared.alpha, 1, rtol=1e-6)
+    np.testing.assert_array_equal(prepared.color.mean[sampled], buffers.color.mean[sampled])
+    assert (prepared.albedo.mean > 0).all()
+
+
+@pytest.mark.parametrize("rows", [slice(0, 12), slice(10, 15), slice(0, 40)])
+def test_areas_without_a_sample_stay_black(rows: slice, render: SyntheticRender) -> None:
+    spp = np.full((40, 56, 1), 16, np.float32)
+    spp[rows, :30] = 0
+    planes = {
+        name: Buffer(**{plane: image * (spp > 0) for plane, image in buffer.planes()})
+        for name, buffer in render.buffers.quantities()
+    }
+    buffers = render.buffers.with_quantities(**planes)
+    with_counts = prepare_input(replace(buffers, spp=spp), 1)
+    assert not any("no sample" in note for note in with_counts.notes)
+    np.testing.assert_array_equal(with_counts.buffers.color.mean, buffers.color.mean)
+    spp[...] = 0
+    assert prepare_input(replace(buffers, spp=spp), 1).notes == with_counts.notes
+
+
 @pytest.mark.parametrize(("factor", "kept"), [(16, False), (1 / 16, False), (2, True), (1, True)])
 def test_a_variance_that_the_halves_contradict_is_left_out(
     factor: float, kept: bool, render: SyntheticRender

@@ -42,12 +42,15 @@ def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> Halves
     halves may be copies of one image. The correlation is taken of what a second-order difference leaves of
     both halves. Where texture makes it positive, the variance of the colour decides; if that is unknown, only
     copies are taken for dependent. Without halves, and where the image does not show it, ``independent`` is
-    False. Expects sanitised buffers.
+    False. Pixels without a sample tell nothing. Expects sanitised buffers.
     """
     color = buffers.color
     if color.halves is None:
         return HalvesTest()
-    return _core.compare_halves(*color.halves, color.variance, thread_count(threads))
+    half_a, half_b = color.halves
+    if isinstance(buffers.spp, np.ndarray) and not buffers.spp.all():
+        half_a, half_b = (np.where(buffers.spp > 0, half, np.float32(np.nan)) for half in color.halves)
+    return _core.compare_halves(half_a, half_b, color.variance, thread_count(threads))
 
 
 def without_single_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:

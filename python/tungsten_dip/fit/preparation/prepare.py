@@ -23,6 +23,9 @@ from tungsten_dip.fit.result import FitResult
 
 _LOG = logging.getLogger(__name__)
 
+_GAP_RADII = (2, 1)
+"""Radii of the windows whose samples fill a gap; the smaller one, where it has any, tells surfaces apart."""
+
 _LARGEST_ALBEDO = 2.0
 """Albedo of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far
 above."""
@@ -45,7 +48,8 @@ class Prepared:
 def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
     """Check and sanitise the input.
 
-    An albedo in another scale and a variance of something else are left out, halves that are lost are drawn.
+    An albedo in another scale and a variance of something else are left out, halves that are lost are drawn,
+    and gaps between samples are filled.
 
     Raises InputError if these are no buffers or the image is empty.
     """
@@ -62,8 +66,42 @@ def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
     buffers, lost = _without_lost_halves(buffers, rendered, thread_count(threads))
+    buffers, gaps = _with_gaps_filled(buffers, thread_count(threads))
     buffers, variance = without_foreign_variance(buffers, threads)
-    return Prepared(buffers, (*single, *foreign, *repaired, *lost, *variance))
+    return Prepared(buffers, (*single, *foreign, *repaired, *lost, *gaps, *variance))
+
+
+def _with_gaps_filled(buffers: RenderBuffers, threads: int) -> tuple[RenderBuffers, tuple[str, ...]]:
+    """Return sanitised buffers with gaps between samples filled, and a note if there are any.
+
+    Renderers leave pixels without a sample black, which is nothing that a sample found. They get the mean of
+    the pixels around that have some. Areas without a sample, of 5x5 pixels or more, were not rendered: they
+    stay as they are.
+    """
+    spp = buffers.spp
+    if not isinstance(spp, np.ndarray) or spp.all():
+        return buffers, ()
+    sampled = (spp > 0).astype(np.float32)
+    outside = (_core.box_mean(sampled, _GAP_RADII[0], threads) == 0).astype(np.float32)
+    gaps = (spp == 0) & (_core.box_mean(outside, _GAP_RADII[0], threads) == 0)
+    count = np.count_nonzero(gaps)
+    if count == 0:
+        return buffers, ()
+
+    def filled(image: FloatImage) -> FloatImage:
+        for radius in _GAP_RADII:
+            share = _core.box_mean(sampled, radius, threads)
+            around = _core.box_mean(image * sampled, radius, threads) / np.maximum(share, np.float32(1e-3))
+            image = np.where(gaps & (share > 0), around, image)
+        return image
+
+    quantities = {
+        name: Buffer(**{plane: filled(image) for plane, image in buffer.planes()})
+        for name, buffer in buffers.quantities()
+    }
+    alpha = None if buffers.alpha is None else filled(buffers.alpha)
+    note = f"{count} of {gaps.size} pixels have no sample: they are filled with the mean of those around them"
+    return replace(buffers.with_quantities(**quantities), alpha=alpha), (note,)
 
 
 def _without_lost_halves(
