@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from fitted_models import check_result, evidence_of, short
-from synthetic import SyntheticRender, synthetic_render
+from synthetic import SyntheticRender, relmse, synthetic_render
 from tungsten_dip.fit import FitSettings, blending, denoise
 from tungsten_dip.fit.network import training
 from tungsten_dip.fit.network.blend_network import HIDDEN, BlendNetwork, Examples
 from tungsten_dip.fit.network.training import LEARNING_RATE, _batches, start_of_training
-from tungsten_dip.fit.presets import BALANCED_PILOTS, DRAFT_PILOTS
+from tungsten_dip.fit.presets import BALANCED_PILOTS, DRAFT_PILOTS, RECIPES
 from tungsten_dip.fit.settings import Preset
 
 
@@ -70,11 +70,22 @@ def test_a_time_budget_is_spent_on_one_network(
     preset: Preset, time_budget_s: float | None, members: int, steps: int
 ) -> None:
     result = denoise(
-        synthetic_render(16, 24).buffers, FitSettings(preset, time_budget_s=time_budget_s, threads=1)
+        synthetic_render(32, 32).buffers, FitSettings(preset, time_budget_s=time_budget_s, threads=1)
     )
     assert result.model is not None
     assert np.shape(result.model.weights["layer1.bias"]) == (members * HIDDEN,)
     assert result.iterations == steps
+
+
+@pytest.mark.parametrize("preset", ["balanced", "final"])
+def test_the_noise_of_few_pixels_is_not_learnt(preset: Preset) -> None:
+    render = synthetic_render(16, 16, spp=8)
+    fitted, longer = (
+        denoise(render.buffers, FitSettings(preset, iterations=steps, threads=1))
+        for steps in (None, RECIPES[preset].steps)
+    )
+    assert fitted.iterations < longer.iterations
+    assert relmse(fitted.color, render.reference) < 0.9 * relmse(longer.color, render.reference)
 
 
 def test_the_time_budget_ends_the_training(render: SyntheticRender) -> None:

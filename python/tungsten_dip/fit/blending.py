@@ -26,7 +26,7 @@ from tungsten_dip.fit.network.training import Training, start_of_training, train
 from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
 from tungsten_dip.fit.output.denoised import denoised_image, image_without_noise
 from tungsten_dip.fit.preparation.splitting import with_independent_halves
-from tungsten_dip.fit.presets import pilots_for_size, recipe_of
+from tungsten_dip.fit.presets import pilots_for_size, recipe_of, steps_for_size
 from tungsten_dip.fit.result import DenoisedImage, FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.stages import stage
@@ -89,7 +89,7 @@ def fit_blend(
         # Each network keeps one core busy; these pilots take what is left of all of them.
         if threads == 1:
             beside.result()
-        steps = settings.iterations or recipe.steps
+        steps = settings.iterations or steps_for_size(recipe.steps, buffers.width, buffers.height)
         training = train(
             network, start, settings, steps, recipe.batch_pixels, clock, stage(progress, "training")
         )

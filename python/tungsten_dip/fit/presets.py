@@ -55,6 +55,10 @@ with more of them the rims of lamps, few pixels, come out worse."""
 STEPS_OF_ONE_NETWORK = 240
 """Steps of one network by itself: after fewer, walls are more blotched. The mean of several needs fewer."""
 
+_FEW_PIXELS = 32 * 32
+_STEPS_ON_FEW_PIXELS = 40
+"""Images of fewer pixels have no more steps, or their network would learn the noise of those pixels."""
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -100,3 +104,8 @@ def pilots_for_size(pilots: tuple[Pilot, ...], width: int, height: int) -> tuple
     # One model of first order cannot stand for a whole image.
     largest = max(_LARGE_RADIUS, (max(width, height) - 1) // 2)
     return tuple(pilot for pilot in pilots if pilot.radius <= largest)
+
+
+def steps_for_size(steps: int, width: int, height: int) -> int:
+    """Return how many of the steps an image has enough pixels for."""
+    return min(steps, _STEPS_ON_FEW_PIXELS) if width * height < _FEW_PIXELS else steps
