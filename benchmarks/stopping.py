@@ -26,7 +26,7 @@ PRESETS: tuple[Preset, ...] = ("draft", "balanced")
 EVERY = 20
 
 
-def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
+def psnrs(bench_set: BenchSet, preset: Preset, seed: int) -> list[float]:
     """Return the PSNR in dB after every `EVERY` steps of a fit."""
     found: list[float] = []
     starts: list[Start] = []
@@ -54,7 +54,7 @@ def psnrs(bench_set: BenchSet, preset: Preset) -> list[float]:
         mock.patch.object(blending, "BlendNetwork", Watched),
         mock.patch.object(blending, "start_of_training", start),
     ):
-        denoise(bench_set.buffers, FitSettings(preset))
+        denoise(bench_set.buffers, FitSettings(preset, seed=seed))
     return found
 
 
@@ -64,11 +64,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("sets", metavar="SET=REFERENCE", nargs="+")
-    sets = read_sets(parser.parse_args().sets)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    sets = read_sets(options.sets)
     print("| |", *(f"{Path(s.name)} |" for s in sets))
     print("|---|" + "---|" * len(sets))
     for preset in PRESETS:
-        curves = [psnrs(bench_set, preset) for bench_set in sets]
+        curves = [psnrs(bench_set, preset, options.seed) for bench_set in sets]
         cells = (f"{curve[-1]:.2f} ({max(curve) - curve[-1]:.2f}) |" for curve in curves)
         print(f"| {preset}, {EVERY * len(curves[0])} steps |", *cells, flush=True)
 

@@ -48,8 +48,8 @@ def fit_blend(
     further, not if a new one is fitted.
 
     ``previous`` are the halves of the previous frame's result, reprojected to this frame: linear radiance in
-    the shape of the colour, NaN where they have no value. They are an extra pilot, with which fewer
-    others are needed.
+    the shape of the colour, NaN where they have no value. They are an extra pilot, with which fewer others
+    are needed.
 
     Ctrl-C during the training or after it ends the fit early. The pilots of all samples are then used if they
     are complete, else given up: the image is made of the halves alone.
