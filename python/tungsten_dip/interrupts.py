@@ -58,13 +58,23 @@ def wait_in_short_turns(pending: Future[Any], between: Callable[[], None] = lamb
         between()
 
 
-def terminations_as_interrupts() -> AbstractContextManager[None]:
-    """Raise KeyboardInterrupt on SIGTERM within the block: for processes that are to end before this one."""
+@contextmanager
+def terminations_as_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM within the block: for processes that are to end before this one.
+
+    It is raised at the end of the block if it was lost within, as in a finaliser.
+    """
+    asked = False
 
     def interrupt() -> None:
+        nonlocal asked
+        asked = True
         raise KeyboardInterrupt
 
-    return _on_signal(signal.SIGTERM, interrupt)
+    with _on_signal(signal.SIGTERM, interrupt):
+        yield
+    if asked:
+        raise KeyboardInterrupt
 
 
 @contextmanager

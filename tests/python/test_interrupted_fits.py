@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from concurrent.futures import wait
+from contextlib import suppress
 from dataclasses import replace
 from threading import Event, main_thread
 from typing import Any
@@ -155,3 +156,13 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
     monkeypatch.setattr(blending, "pilots_of_all_samples", until_given_up)
     with pytest.raises(InputError, match="a test's"):
         denoise(render.buffers, short(preset="balanced", threads=threads))
+
+
+def test_a_termination_that_was_lost_ends_the_block_all_the_same() -> None:
+    """Python ignores exceptions in finalisers."""
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupts.terminations_as_interrupts():  # noqa: PT012
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        done.append("the rest")
+    assert done == ["the rest"]
