@@ -59,12 +59,16 @@ def wait_in_short_turns(pending: Future[Any], between: Callable[[], None] = lamb
 
 
 @contextmanager
-def terminations_as_interrupts() -> Iterator[None]:
+def terminations_as_interrupts() -> Iterator[Callable[[], None]]:
     """Raise KeyboardInterrupt on SIGTERM within the block: for processes that are to end before this one.
 
-    It is raised at the end of the block if it was lost within, as in a finaliser.
+    If it was lost within, as in a finaliser, calling what the block is given raises it, and so does its end.
     """
     asked = False
+
+    def raise_if_asked() -> None:
+        if asked:
+            raise KeyboardInterrupt
 
     def interrupt() -> None:
         nonlocal asked
@@ -72,9 +76,8 @@ def terminations_as_interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
     with _on_signal(signal.SIGTERM, interrupt):
-        yield
-    if asked:
-        raise KeyboardInterrupt
+        yield raise_if_asked
+    raise_if_asked()
 
 
 @contextmanager

@@ -158,11 +158,16 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
         denoise(render.buffers, short(preset="balanced", threads=threads))
 
 
-def test_a_termination_that_was_lost_ends_the_block_all_the_same() -> None:
+@pytest.mark.parametrize("asks", [True, False])
+def test_a_termination_that_was_lost_is_raised_when_asked_or_at_the_end(asks: bool) -> None:
     """Python ignores exceptions in finalisers."""
     done = []
-    with pytest.raises(KeyboardInterrupt), interrupts.terminations_as_interrupts():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), interrupts.terminations_as_interrupts() as raise_if_asked:  # noqa: PT012
+        raise_if_asked()
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
-        done.append("the rest")
-    assert done == ["the rest"]
+        done.append("one")
+        if asks:
+            raise_if_asked()
+        done.append("another")
+    assert done == (["one"] if asks else ["one", "another"])

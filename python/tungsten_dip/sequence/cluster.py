@@ -81,7 +81,7 @@ def denoise_on_cluster(
         run = replace(run, settings=replace(run.settings, threads=share))
     shared = models
     if to_do:
-        with _client(scheduler, workers) as client:
+        with _client(scheduler, workers) as client, terminations_as_interrupts() as raise_if_terminated:
             for done, found, remarks in _done(client, to_do, run, models):
                 shared = found or shared
                 for remark in remarks:
@@ -90,6 +90,7 @@ def denoise_on_cluster(
                     records.append(record)
                     on_record(record)
                     progress(len(records) / len(frames), f"frame {record.number}")
+                raise_if_terminated()
     return sorted(records, key=lambda record: record.number), shared
 
 
@@ -194,8 +195,7 @@ def _client(scheduler: str, workers: int) -> Iterator[Any]:
                     f"--workers {workers}: they do not start ({reason:.200}); use fewer, or allow more "
                     f"memory and open files (ulimit -n)"
                 ) from error
-            with terminations_as_interrupts():
-                yield client
+            yield client
         return
     try:
         client = Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
