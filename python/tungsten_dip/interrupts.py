@@ -16,9 +16,10 @@ _TURN_S = 0.1
 
 
 def deferred_interrupts() -> AbstractContextManager[None]:
-    """Defer Ctrl-C within the block to its end: for imports of libraries.
+    """Defer Ctrl-C within the block to its end.
 
-    An import that is interrupted leaves a module half initialised, or ends the process.
+    For imports of libraries, which would leave a module half initialised or end the process, and for short
+    work without which longer work would be lost.
     """
     return _noted_interrupts(at_once=False)
 

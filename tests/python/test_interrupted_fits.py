@@ -22,6 +22,8 @@ from tungsten_dip.fit import blending, denoise
 from tungsten_dip.fit.network import training
 from tungsten_dip.fit.network.training import Training
 from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
+from tungsten_dip.fit.output.denoised import denoised_image
+from tungsten_dip.fit.settings import Preset
 
 
 def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRender) -> None:
@@ -103,6 +105,23 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
     assert result.iterations == 30
     assert "interrupted after the training of 30 steps" in result.notes
     assert any(note.endswith("the image is made of the halves alone") for note in result.notes)
+
+
+@pytest.mark.usefixtures("_sigint_interrupts")
+@pytest.mark.parametrize("preset", ["draft", "balanced"])
+def test_ctrl_c_while_the_image_is_made_waits_for_it(
+    preset: Preset, render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return denoised_image(*arguments)
+
+    whole = denoise(render.buffers, short(preset=preset))
+    monkeypatch.setattr(blending, "denoised_image", interrupted)
+    result = denoise(render.buffers, short(preset=preset))
+    assert result.interrupted
+    assert result.notes == whole.notes
+    np.testing.assert_array_equal(result.color, whole.color)
 
 
 def test_ctrl_c_during_the_training_keeps_complete_pilots_of_all_samples(render: SyntheticRender) -> None:

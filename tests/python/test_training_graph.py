@@ -51,7 +51,7 @@ def test_gradients_and_updates_agree_with_torch(pixels: int) -> None:
     batch.target[0] += 1e3
 
     in_torch = TorchNetwork(weights)
-    in_onnx = BlendNetwork(weights, len(layout.inputs), layout.candidate_count, "cpu")
+    in_onnx = BlendNetwork(layout, weights, "cpu")
     proto = training_step(len(layout.inputs), layout.candidate_count)
     onnx.checker.check_model(proto, full_check=True)
     vector = np.concatenate([value.ravel() for value in weights.values()])
@@ -86,10 +86,9 @@ def denoised(network: BlendNetwork, examples: Examples) -> FloatArray:
 def test_members_are_networks_by_themselves_and_their_mean_is_the_image() -> None:
     examples, layout = examples_for_training()
     weights = first_weights(layout, seed=3, members=3)
-    sizes = len(layout.inputs), layout.candidate_count
-    together = BlendNetwork(weights, *sizes, "cpu", threads=2)
+    together = BlendNetwork(layout, weights, "cpu", threads=2)
     parts = {name: np.split(value, 3) for name, value in weights.items()}
-    alone = [BlendNetwork({name: part[k] for name, part in parts.items()}, *sizes, "cpu") for k in range(3)]
+    alone = [BlendNetwork(layout, {name: part[k] for name, part in parts.items()}, "cpu") for k in range(3)]
     for first in range(0, 300, 100):
         for network in (together, *alone):
             network.step(examples.part(first, first + 100), 1e-2)

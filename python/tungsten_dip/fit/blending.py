@@ -30,7 +30,7 @@ from tungsten_dip.fit.presets import pilots_for_size, recipe_of, steps_for_size
 from tungsten_dip.fit.result import DenoisedImage, FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.stages import stage
-from tungsten_dip.interrupts import wait_in_short_turns
+from tungsten_dip.interrupts import deferred_interrupts, wait_in_short_turns
 from tungsten_dip.progress import Progress
 
 
@@ -72,13 +72,7 @@ def fit_blend(
     del cues  # Large images need gigabytes for them.
     if start.warm and refit_steps is not None:
         settings = replace(settings, iterations=refit_steps)
-    network = BlendNetwork(
-        start.weights,
-        len(evidence.layout.inputs),
-        evidence.layout.candidate_count,
-        settings.device,
-        threads,
-    )
+    network = BlendNetwork(evidence.layout, start.weights, settings.device, threads)
 
     def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
         if not recipe.all_samples:
@@ -97,8 +91,12 @@ def fit_blend(
     if training.interrupted and recipe.all_samples and not all_samples_pilots:
         training.notes.append("without the pilots of all samples: the image is made of the halves alone")
     inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
-    blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
-    image = denoised_image(evidence, *blended)
+    try:
+        with deferred_interrupts():
+            blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
+            image = denoised_image(evidence, *blended)
+    except KeyboardInterrupt:
+        training.interrupted = True
     model = Model(
         inputs=evidence.layout.inputs,
         weights=network.weights(),

@@ -53,9 +53,7 @@ def infer_blend(
     all_samples_pilots: tuple[FloatImage, ...] = ()
     if recipe_of(settings, following=previous is not None).all_samples:
         all_samples_pilots = pilots_of_all_samples(evidence, halved.buffers, clock, with_oidn=with_oidn)
-    network = BlendNetwork(
-        model.weights, len(layout.inputs), layout.candidate_count, settings.device, threads
-    )
+    network = BlendNetwork(layout, model.weights, settings.device, threads)
     blended = _blended(network, model.blend, evidence.candidates, cues, all_samples_pilots, threads)
     image = denoised_image(evidence, *blended)
     progress(1.0, "inferred")

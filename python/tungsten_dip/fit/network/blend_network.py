@@ -130,9 +130,8 @@ _Member = dict[str, FloatArray]
 class BlendNetwork:
     """The members of a network and the states of their optimisers; each keeps one of ``threads`` busy."""
 
-    def __init__(
-        self, weights: Weights, inputs: int, candidates: int, device: Device, threads: int = 1
-    ) -> None:
+    def __init__(self, layout: Layout, weights: Weights, device: Device, threads: int = 1) -> None:
+        inputs, candidates = len(layout.inputs), layout.candidate_count
         self._threads = threads
         self._shapes = weight_shapes(inputs, candidates)
         # The network is too small to share: threads would only wait for one another.

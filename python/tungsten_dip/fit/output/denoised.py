@@ -77,8 +77,9 @@ def denoised_image(
         with_detail = np.maximum(all_samples_blend + (image - blended), 0)
         image = with_all_samples(denoised, with_detail, threads)
     if not evidence.halves_drawn:
-        image = image * gain_of_lost_light(noisy, image, threads)
         light = gain_of_lost_light(noisy, mean_of(denoised), threads)
+        light_of_all = light if all_samples_blend is None else gain_of_lost_light(noisy, image, threads)
+        image = image * light_of_all
         denoised = denoised[0] * light, denoised[1] * light
     pixels = denoised[0].reshape(-1, 3), denoised[1].reshape(-1, 3)
     error = estimate_error(evidence.candidates, evidence.scale, pixels).reshape(*image.shape[:2], 1)
