@@ -7,6 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
+import moving_camera
 from moving_camera import HEIGHT, WIDTH, true_frame
 from synthetic import relmse, synthetic_render
 from tungsten_dip.buffers.image_file import write_exr, write_image
@@ -553,6 +554,16 @@ def test_the_network_of_followed_frames_is_trained_in_full(tmp_path):
     follower = Follower(replace(DRAFT, iterations=5))
     followed = [follower.denoise(frame.buffers, frame.camera).result for frame in frames]
     assert [result.iterations for result in followed] == [5, 240]
+
+
+def test_the_network_of_followed_frames_of_few_pixels_is_trained_less(tmp_path, monkeypatch):
+    monkeypatch.setattr(moving_camera, "WIDTH", 24)
+    monkeypatch.setattr(moving_camera, "HEIGHT", 16)
+    frames = [true_frame(tmp_path, 0.05 * n, seed=n) for n in range(2)]
+    follower = Follower(DRAFT)
+    followed = [follower.denoise(frame.buffers, frame.camera) for frame in frames]
+    assert [frame.how for frame in followed] == ["fitted", "followed"]
+    assert [frame.result.iterations for frame in followed] == [40, 40]
 
 
 @pytest.mark.parametrize("refit", ["auto", 3])

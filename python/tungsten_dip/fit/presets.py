@@ -85,14 +85,14 @@ RECIPES = {
 def recipe_of(settings: FitSettings, *, following: bool) -> Recipe:
     """Return the recipe of the settings' preset, or the one for frames that are ``following`` another."""
     recipe = RECIPES[settings.preset]
-    if recipe.members > 1 and (following or settings.time_budget_s is not None):
-        # A time budget, or the little time of a frame, is better spent on the steps of one network.
-        recipe = replace(recipe, members=1, steps=STEPS_OF_ONE_NETWORK)
     if following:
         # The previous frame moved into place has no counterpart among the pilots of all samples.
         pilots = FOLLOWING_DRAFT_PILOTS if settings.preset == "draft" else FOLLOWING_PILOTS
-        return replace(recipe, pilots=pilots, batch_pixels=_SMALL_BATCH_PIXELS, all_samples=False)
+        return Recipe(pilots, STEPS_OF_ONE_NETWORK, _SMALL_BATCH_PIXELS, all_samples=False)
     if settings.time_budget_s is not None:
+        if recipe.members > 1:
+            # The time is better spent on the steps of one network.
+            recipe = replace(recipe, members=1, steps=STEPS_OF_ONE_NETWORK)
         # Those of draft are enough by themselves where there is no time for others.
         others = tuple(pilot for pilot in recipe.pilots if pilot not in DRAFT_PILOTS)
         recipe = replace(recipe, pilots=(*DRAFT_PILOTS, *others))

@@ -184,8 +184,8 @@ class Follower:
             if model is not None and steps == 0:
                 result = infer_blend(model, buffers, self._settings, progress, previous=moved)
             else:
-                of_new = self._settings.iterations if moved is None else STEPS_OF_ONE_NETWORK
-                settings = replace(self._settings, iterations=of_new)
+                # The iterations are those of a first frame.
+                settings = self._settings if moved is None else replace(self._settings, iterations=None)
                 result = fit_blend(buffers, settings, progress, model, moved, refit_steps=steps)
         except InputError as problem:
             if last is None:
