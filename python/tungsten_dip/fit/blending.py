@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from threading import Event
 from types import TracebackType
 from typing import Self
@@ -20,18 +20,23 @@ from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import evidence_from_buffers
-from tungsten_dip.fit.model import Model, source_sha256
-from tungsten_dip.fit.network.blend_network import BlendNetwork
+from tungsten_dip.fit.model import Blend, Model, Weights, source_sha256
+from tungsten_dip.fit.network.blend_network import BlendNetwork, joined_members
 from tungsten_dip.fit.network.training import Training, start_of_training, train
 from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
-from tungsten_dip.fit.output.denoised import denoised_image, image_without_noise
-from tungsten_dip.fit.preparation.splitting import with_independent_halves
-from tungsten_dip.fit.presets import pilots_for_size, recipe_of, steps_for_size
+from tungsten_dip.fit.output.denoised import denoised_image, image_without_noise, mean_of_images
+from tungsten_dip.fit.preparation.splitting import (
+    HalvedImage,
+    are_pixels_independent,
+    regrouped,
+    with_independent_halves,
+)
+from tungsten_dip.fit.presets import Recipe, pilots_for_size, recipe_of, steps_for_size
 from tungsten_dip.fit.result import DenoisedImage, FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.stages import stage
 from tungsten_dip.interrupts import deferred_interrupts, wait_in_short_turns
-from tungsten_dip.progress import Progress
+from tungsten_dip.progress import Progress, part_of
 
 
 def fit_blend(
@@ -61,59 +66,116 @@ def fit_blend(
         return result_from_image(unchanged, settings, clock)
     halved = with_independent_halves(buffers, settings.seed, threads)
     recipe = recipe_of(settings, following=previous is not None)
-    blend = None if warm_start is None else warm_start.blend
-    plan = pilots_for_size(recipe.pilots, buffers.width, buffers.height) if blend is None else blend.layout
-    with_oidn = settings.pilot == "oidn"
-    evidence, cues = evidence_from_buffers(
-        halved, plan, clock, progress, threads=threads, with_oidn=with_oidn, previous=previous
-    )
-    start = start_of_training(evidence, cues, settings.seed, warm_start, recipe.members)
-    evidence = start.evidence
-    del cues  # Large images need gigabytes for them.
-    if start.warm and refit_steps is not None:
-        settings = replace(settings, iterations=refit_steps)
-    network = BlendNetwork(evidence.layout, start.weights, settings.device, threads)
-
-    def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
-        if not recipe.all_samples:
-            return ()
-        return pilots_of_all_samples(evidence, halved.buffers, clock, with_oidn=with_oidn, given_up=given_up)
-
-    with _AllSamplesPilots(pilots_beside) as beside:
-        # Each network keeps one core busy; these pilots take what is left of all of them.
-        if threads == 1:
-            beside.result()
-        steps = settings.iterations or steps_for_size(recipe.steps, buffers.width, buffers.height)
-        training = train(
-            network, start, settings, steps, recipe.batch_pixels, clock, stage(progress, "training")
-        )
-        all_samples_pilots = beside.result_after(training)
-    if training.interrupted and recipe.all_samples and not all_samples_pilots:
-        training.notes.append("without the pilots of all samples: the image is made of the halves alone")
-    inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
-    try:
-        with deferred_interrupts():
-            blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
-            image = denoised_image(evidence, *blended)
-    except KeyboardInterrupt:
-        training.interrupted = True
+    if warm_start is not None or not are_pixels_independent(halved.halves):
+        recipe = replace(recipe, groupings=1)
+    fitter = _Fitter(settings, recipe, clock, threads, warm_start, previous, refit_steps)
+    first = fitter.fit(halved, part_of(progress, 0, 1 / recipe.groupings))
+    fits, training = [first], first.training
+    for index in range(1, recipe.groupings):
+        if training.interrupted or training.stopped:
+            break
+        part = part_of(progress, index / recipe.groupings, (index + 1) / recipe.groupings)
+        try:
+            further = fitter.fit(regrouped(halved, settings.seed, index), part, index, first)
+            if further.training.interrupted:
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            training.interrupted = True
+            training.notes.append(f"interrupted: made of {index} of {recipe.groupings} groupings of samples")
+            break
+        fits.append(further)
+    image = mean_of_images([fit.image for fit in fits])
     model = Model(
-        inputs=evidence.layout.inputs,
-        weights=network.weights(),
-        settings=settings,
+        inputs=first.blend.layout.inputs,
+        weights=joined_members([fit.weights for fit in fits]),
+        settings=first.settings,
         estimated_relmse=image.estimated_relmse,
         source_sha256=source_sha256(buffers),
-        blend=start.blend,
+        blend=first.blend,
     )
     if not training.interrupted:
         progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
     return replace(
-        result_from_image(image, settings, clock, evidence.halves_drawn, model),
+        result_from_image(image, first.settings, clock, halved.drawn, model),
         iterations=training.steps_done,
         history=tuple(training.history),
         interrupted=training.interrupted,
         notes=(*image.notes, *training.notes),
     )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What a fit to one grouping of the samples into halves gives; ``weights`` are those of its members."""
+
+    image: DenoisedImage
+    weights: Weights
+    blend: Blend
+    settings: FitSettings
+    training: Training
+    all_samples_pilots: tuple[FloatImage, ...]
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """Fits a network to a grouping of an image's samples into halves; the fields are those of `fit_blend`."""
+
+    settings: FitSettings
+    recipe: Recipe
+    clock: Clock
+    threads: int
+    warm_start: Model | None
+    previous: Halves | None
+    refit_steps: int | None
+
+    def fit(self, image: HalvedImage, progress: Progress, index: int = 0, first: _Fit | None = None) -> _Fit:
+        """Fit the members of one grouping; layout and pilots of all samples are the ``first`` one's."""
+        settings, recipe, threads = self.settings, self.recipe, self.threads
+        width, height = image.buffers.width, image.buffers.height
+        blend = first.blend if first else self.warm_start.blend if self.warm_start else None
+        plan = pilots_for_size(recipe.pilots, width, height) if blend is None else blend.layout
+        with_oidn = settings.pilot == "oidn"
+        evidence, cues = evidence_from_buffers(
+            image, plan, self.clock, progress, threads=threads, with_oidn=with_oidn, previous=self.previous
+        )
+        members = recipe.members // recipe.groupings
+        start = start_of_training(
+            evidence, cues, settings.seed + index, members, self.warm_start, first.blend if first else None
+        )
+        evidence = start.evidence
+        del cues  # Large images need gigabytes for them.
+        if start.warm and self.refit_steps is not None:
+            settings = replace(settings, iterations=self.refit_steps)
+        network = BlendNetwork(evidence.layout, start.weights, settings.device, threads)
+
+        def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
+            if first is not None:
+                return first.all_samples_pilots
+            if not recipe.all_samples:
+                return ()
+            return pilots_of_all_samples(
+                evidence, image.buffers, self.clock, with_oidn=with_oidn, given_up=given_up
+            )
+
+        with _AllSamplesPilots(pilots_beside) as beside:
+            # Each network keeps one core busy; these pilots take what is left of all of them.
+            if threads == 1:
+                beside.result()
+            steps = settings.iterations or steps_for_size(recipe.steps, width, height)
+            training = train(
+                network, start, settings, steps, recipe.batch_pixels, self.clock, stage(progress, "training")
+            )
+            all_samples_pilots = beside.result_after(training)
+        if training.interrupted and recipe.all_samples and not all_samples_pilots:
+            training.notes.append("without the pilots of all samples: the image is made of the halves alone")
+        inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
+        try:
+            with deferred_interrupts():
+                blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
+                denoised = denoised_image(evidence, *blended)
+        except KeyboardInterrupt:
+            training.interrupted = True
+        return _Fit(denoised, network.weights(), start.blend, settings, training, all_samples_pilots)
 
 
 class _AllSamplesPilots:

@@ -10,6 +10,7 @@ needs.
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +54,11 @@ _SAMPLES_OF_RIM = 4.0
 """If a part p of n samples hits a lamp at its rim, the number of hits is split among halves with a variance
 that is about Beta's for the shape n p / (1 - p) (hypergeometric). Images of few samples need it most."""
 
+_ALIKE = 0.05
+_STANDARD_ERRORS = 4.0
+"""So many more neighbours than half may have noise of one sign (twice that share), and so many standard
+errors."""
+
 _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
 
@@ -92,6 +98,39 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int) -> 
         f"two; the estimated error may be too low"
     )
     return HalvedImage(_with_drawn_halves(buffers, seed, threads), drawn=True, notes=(note,))
+
+
+def are_pixels_independent(halves: Halves) -> bool:
+    """Whether the noise of neighbouring pixels is independent, as far as signs tell.
+
+    The halves' difference has either sign with the same probability. Reconstruction filters that add a sample
+    to several pixels make the signs of neighbours alike.
+    """
+    signs = np.sign(channel_mean(halves[0] - halves[1])[:, :, 0])
+    for products in (signs[1:] * signs[:-1], signs[:, 1:] * signs[:, :-1]):
+        count = int(np.count_nonzero(products))
+        allowed = _ALIKE + _STANDARD_ERRORS / math.sqrt(max(count, 1))
+        if float(products.sum()) > allowed * count:
+            return False
+    return True
+
+
+def regrouped(image: HalvedImage, seed: int, index: int) -> HalvedImage:
+    """Return the image with its halves swapped in half of the pixels, chosen at random.
+
+    Where pixels are independent, these are two other halves of the samples. Another ``index`` chooses others.
+    """
+    buffers = image.buffers
+    chosen = np.random.default_rng([seed, index]).random((buffers.height, buffers.width, 1)) < 0.5
+
+    def swapped(buffer: Buffer) -> Buffer:
+        if buffer.halves is None:
+            return buffer
+        a, b = buffer.halves
+        return replace(buffer, half_a=np.where(chosen, b, a), half_b=np.where(chosen, a, b))
+
+    quantities = {name: swapped(buffer) for name, buffer in buffers.quantities()}
+    return replace(image, buffers=buffers.with_quantities(**quantities))
 
 
 def with_lost_halves_drawn(
