@@ -1,5 +1,6 @@
 """What both commands share: exit statuses, durations, interrupts, terminals."""
 
+import argparse
 import io
 import logging
 import os
@@ -78,6 +79,20 @@ def test_a_bare_number_means_minutes_to_tungsten():
 def test_texts_that_are_no_duration(text):
     with pytest.raises(Exception, match="expected a duration"):
         duration(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["9" * 20_000 + "x", "1." + "9" * 20_000 + "x", "1s" * 20_000 + "x", "9" * 400]
+)
+def test_a_long_text_that_is_no_duration_is_refused_in_one_short_line(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="expected a duration") as refused:
+        duration(text)
+    assert len(str(refused.value)) < 200
+
+
+def test_durations_that_add_up_to_more_than_any_number_are_refused():
+    with pytest.raises(argparse.ArgumentTypeError, match="expected a duration"):
+        duration(("1" + "0" * 308 + "s") * 2)
 
 
 @pytest.mark.parametrize("redirection", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])

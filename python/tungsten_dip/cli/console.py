@@ -44,6 +44,9 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 SECONDS_BY_UNIT = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
+_NUMBER_AND_UNIT = r"(\d+(?:\.\d*)?|\.\d+)(ms|[smhd]|$)"
+"""Matches no text in two ways: the texts of a scene file may be long, and must not take long to refuse."""
+
 LINE_INTERVAL_S = 5.0
 """How often progress is reported where there is no terminal to draw a bar on."""
 
@@ -200,10 +203,13 @@ def duration(text: str, default_unit: str = "s") -> float:
     Raises argparse.ArgumentTypeError if the text is none of these.
     """
     compact = "".join(text.split()).lower()
-    parts = re.findall(r"(\d+\.?\d*|\.\d+)(ms|[smhd]|$)", compact)
-    if not parts or "".join(number + unit for number, unit in parts) != compact:
-        raise argparse.ArgumentTypeError(f"expected a duration such as 90s, 5m or 1.5h, got '{text}'")
-    return math.fsum(float(number) * SECONDS_BY_UNIT[unit or default_unit] for number, unit in parts)
+    seconds = math.inf
+    if re.fullmatch(f"(?:{_NUMBER_AND_UNIT})+", compact):
+        parts = re.findall(_NUMBER_AND_UNIT, compact)
+        seconds = sum(float(number) * SECONDS_BY_UNIT[unit or default_unit] for number, unit in parts)
+    if not math.isfinite(seconds):  # nor is the value of some hundred digits
+        raise argparse.ArgumentTypeError(f"expected a duration such as 90s, 5m or 1.5h, got '{text:.60}'")
+    return seconds
 
 
 def minutes(text: str) -> float:
