@@ -82,6 +82,14 @@ def test_a_glob_is_numbered_by_the_last_digits(folders):
     assert [f.input.name for f in find_frames(f"{folders}/s*", "f#.exr", (7,))] == ["shot2_f0007.exr"]
 
 
+def test_a_glob_matches_hidden_files_only_if_it_begins_with_a_dot(tmp_path):
+    for name in ("f1.exr", ".f2.exr"):
+        (tmp_path / name).touch()
+    (tmp_path / ".f1-00c0ffee.tungsten-dip.exr").touch()  # as a writer leaves that was killed
+    assert [each.input.name for each in find_frames(f"{tmp_path}/*.exr", "o#.exr")] == ["f1.exr"]
+    assert [each.input.name for each in find_frames(f"{tmp_path}/.f?.exr", "o#.exr")] == [".f2.exr"]
+
+
 @pytest.mark.parametrize("outputs", ["f####.exr", "f#_v2.exr", "../{}/f%d.exr"])
 def test_results_that_a_glob_matches_are_no_frames(tmp_path, fitted, frame, outputs):
     for number in (0, 1, 2):

@@ -160,8 +160,11 @@ def _is_result(path: Path) -> bool:
 
 
 def _glob(pattern: str) -> list[Path]:
+    """Return what a pattern matches: as in a shell, hidden files only if its last name begins with a dot."""
     path = Path(pattern)
+    hidden = path.name.startswith(".")
     try:
-        return sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        found = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        return [match for match in found if hidden or not match.name.startswith(".")]
     except ValueError as error:  # of ** beside other signs, in Python 3.11 and 3.12
         raise InputError(f"{pattern}: is no pattern for files ({error}); use f####, f%04d or f*") from error
