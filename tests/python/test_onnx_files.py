@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -14,10 +15,20 @@ from tungsten_dip.fit import FitSettings
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
 from tungsten_dip.fit.network.blend_network import first_weights
+from tungsten_dip.fit.presets import RECIPES, recipe_of
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx import file as model_file
 from tungsten_dip.onnx import load_model, save_model
 from tungsten_dip.onnx.file import proto_from_model
+
+PILOTS = sorted(
+    {
+        pilot
+        for preset, following in itertools.product(RECIPES, (False, True))
+        for pilot in recipe_of(FitSettings(preset), following=following).pilots  # type: ignore[arg-type]
+    },
+    key=repr,
+)
 
 
 def assert_same(first: Model, second: Model) -> None:
@@ -50,26 +61,7 @@ def test_round_trip(model: Model, saved: Path) -> None:
 @settings(max_examples=30, deadline=None)
 @given(
     features=strategies.lists(strategies.sampled_from(["albedo.R", "normal.X", "depth.Z"]), unique=True),
-    pilots=strategies.lists(
-        strategies.builds(
-            Pilot,
-            kind=strategies.just("features"),
-            radius=(radii := strategies.integers(1, 32).map(lambda r: 2 * r)),
-            step=(steps := strategies.sampled_from([1, 2])),
-            with_position=strategies.booleans(),
-        )
-        | strategies.builds(
-            Pilot,
-            kind=strategies.sampled_from(["guided", "color"]),
-            radius=radii,
-            step=steps,
-            k=strategies.floats(0.1, 10),
-            with_position=strategies.booleans(),
-        )
-        | strategies.builds(Pilot, kind=strategies.just("edges"), radius=radii),
-        min_size=1,
-        max_size=4,
-    ),
+    pilots=strategies.lists(strategies.sampled_from(PILOTS), min_size=1, unique=True),
     extra_count=strategies.integers(0, 2),
     relmse=strategies.none() | strategies.floats(0, 1e9),
     seed=strategies.integers(0, 2**63 - 1),

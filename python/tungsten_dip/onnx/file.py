@@ -12,7 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -26,6 +26,13 @@ from tungsten_dip.buffers.atomic import check_writable, replacing
 from tungsten_dip.errors import InputError, check_type
 from tungsten_dip.fit.layout import Layout, Pilot
 from tungsten_dip.fit.model import Blend, Model
+from tungsten_dip.fit.presets import (
+    BALANCED_PILOTS,
+    DRAFT_PILOTS,
+    FINAL_PILOTS,
+    FOLLOWING_DRAFT_PILOTS,
+    FOLLOWING_PILOTS,
+)
 from tungsten_dip.fit.settings import NETWORK_SETTINGS, FitSettings
 from tungsten_dip.fit.standardisation import Standardisation
 from tungsten_dip.onnx.graph import graph_of
@@ -42,8 +49,11 @@ _PROPERTY = "tungsten_dip"
 _NO_ONNX = "expected an ONNX model, found another file or a truncated one; save it again with --save-model"
 _MOST_PARTS = 1 << 16
 _LARGEST_COUNT = 1 << 16
-_LARGEST_RADIUS = 64
-_MOST_CANDIDATES = 64
+_PILOTS = (*DRAFT_PILOTS, *BALANCED_PILOTS, *FINAL_PILOTS, *FOLLOWING_DRAFT_PILOTS, *FOLLOWING_PILOTS)
+"""What a file may name: filters with any radius could take hours."""
+
+_MOST_EXTRA_PILOTS = 2
+"""Open Image Denoise's image and the previous frame."""
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -229,29 +239,26 @@ def _model_from_facts(facts: dict[str, Any], tensors: dict[str, TensorProto]) ->
 
 def _layout(facts: dict[str, Any]) -> Layout:
     given = facts.get("pilots")
-    if not isinstance(given, list):
-        raise InputError("pilots: expected a list")
-    pilots = []
+    if not isinstance(given, list) or not given:
+        raise InputError("pilots: expected a list of one or more")
+    pilots: list[Pilot] = []
     for values in given:
-        pilot = _object("pilots", values)
-        hints = get_type_hints(Pilot)
-        if pilot.keys() != {field.name for field in fields(Pilot)}:
-            raise InputError(f"pilots: expected {', '.join(hints)}, found {', '.join(pilot)}"[:200])
-        checked = {name: _checked(name, pilot[name], hints[name]) for name in hints}
-        try:
-            pilots.append(Pilot(**checked))
-        except ValueError as error:
-            raise InputError(f"pilots: {error}") from None
-        if pilots[-1].radius > _LARGEST_RADIUS:
-            raise InputError(f"pilots: expected a radius up to {_LARGEST_RADIUS}, found {pilots[-1].radius}")
-        if pilots[-1].k is not None and not 0.01 <= pilots[-1].k <= 100:
-            raise InputError("pilots: expected k from 0.01 to 100")
+        pilot = next((pilot for pilot in _PILOTS if asdict(pilot) == values), None)
+        if pilot is None:
+            raise InputError(f"pilots: expected those of the presets of this version, found {values!r:.100}")
+        if pilot in pilots:
+            raise InputError(f"pilots: expected each once, found two of {values!r:.100}")
+        pilots.append(pilot)
     features = _checked("features", facts.get("features"), tuple[str, ...])
+    if len(set(features)) < len(features):
+        raise InputError("features: expected each once, found one of them twice")
     extra_count, baseline = (_checked(n, facts.get(n), int) for n in ("extra_pilots", "baseline"))
+    if extra_count > _MOST_EXTRA_PILOTS:
+        raise InputError(f"extra_pilots: expected at most {_MOST_EXTRA_PILOTS}, found {extra_count}")
     layout = Layout(features, tuple(pilots), extra_count, baseline)
-    if not pilots or layout.candidate_count > _MOST_CANDIDATES or not 0 < baseline < layout.candidate_count:
+    if not 0 < baseline < layout.candidate_count:
         raise InputError(
-            f"layout: expected one pilot or more, and at most {_MOST_CANDIDATES} images to blend"
+            f"baseline: expected a number from 1 to {layout.candidate_count - 1}, found {baseline}"
         )
     return layout
 
