@@ -13,7 +13,9 @@ class Candidates:
     """The noisy image, the pilots (one at least) and the extra pilots, in the order of the network's weights.
 
     Both halves of each are linear radiance of shape (height, width, 3), or (pixels, 3), in the units of
-    `evidence.Evidence`. The first pilot is the one that blurs least, the last one that which blurs most.
+    `evidence.Evidence`. The first pilot blurs little: it stands in for the noisy image where that is too
+    noisy (`estimate.held_out_error`), and for the previous frame where that has no value. The last one may be
+    any: errors are relative to its level or, where the median of all is darker, to that (`measure`).
     """
 
     noisy: Halves

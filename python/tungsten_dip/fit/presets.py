@@ -12,8 +12,9 @@ _EDGES = Pilot("edges", EDGES_SIGMA)
 
 # Small windows keep detail, large ones average out the remaining noise; guided ones keep shadows and
 # reflections, which no feature contains; a regression on the position follows gradients. Within a time budget
-# the first ones are computed, so that cheap ones come first. Errors are relative to the last one that is
-# computed, or to the median.
+# the first ones are computed, so that cheap ones come first. The very first blurs little: it stands in where
+# the noisy image or the previous frame cannot be used. Errors are relative to the last one that is computed
+# or, where the median of all is darker, to that.
 DRAFT_PILOTS = (Pilot("features", 1), _EDGES, Pilot("features", 6, step=2), Pilot("guided", 6, step=2, k=1.0))
 BALANCED_PILOTS = (
     Pilot("features", 1),
