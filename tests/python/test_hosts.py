@@ -134,6 +134,38 @@ def test_available_memory_is_a_part_of_the_whole() -> None:
     assert 0 < available < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({}, 8 << 20),
+        ({"": "max", "pod": "max", "pod/job": "max"}, 8 << 20),
+        ({"": str(5 << 20)}, 3 << 20),
+        ({"pod": str(5 << 20), "pod/job": "max"}, 3 << 20),
+        ({"pod": str(6 << 20), "pod/job": str(5 << 20)}, 3 << 20),
+        ({"pod/job": str(100 << 20)}, 8 << 20),
+        ({"pod/job": str(1 << 20)}, 0),
+        ({"other": str(1 << 20)}, 8 << 20),
+    ],
+)
+def test_available_memory_is_no_more_than_a_container_has(
+    limits: dict[str, str], expected: int, tmp_path: Path
+) -> None:
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/meminfo").write_text(f"MemTotal: 16384 kB\nMemAvailable: {8 << 10} kB\n")
+    (tmp_path / "proc/self/cgroup").write_text("1:cpu:/other\n0::/pod/job\n")
+    for group, limit in limits.items():
+        folder = tmp_path / "sys/fs/cgroup" / group
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "memory.max").write_text(f"{limit}\n")
+        (folder / "memory.current").write_text(f"{3 << 20}\n")
+        (folder / "memory.stat").write_text(f"anon 5\ninactive_file {1 << 20}\nactive_file 7\n")
+    assert memory._available_bytes(tmp_path) == expected
+
+
+def test_available_memory_is_unknown_where_the_system_does_not_tell(tmp_path: Path) -> None:
+    assert memory._available_bytes(tmp_path) is None
+
+
 @pytest.mark.parametrize("quantities", [("depth",), ("color", "albdo")])
 def test_unknown_quantities_are_told_before_memory_is(quantities: Any, scene_path: Path) -> None:
     found = ", ".join(quantities)

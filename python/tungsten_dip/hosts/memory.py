@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tungsten_dip.buffers.image_file import MAX_PIXELS
@@ -41,11 +41,33 @@ def check_fits_mitsuba(scene: Scene, quantities: Sequence[Quantity]) -> None:
         raise too_large(scene.path, f"{width} x {height}", most)
 
 
-def _available_bytes() -> int | None:
-    """Return what Linux can hand out without swapping; None on systems that do not report it."""
+def _available_bytes(root: Path = Path("/")) -> int | None:
+    """Return what this process can have without swapping; None on systems that do not report it.
+
+    That is what Linux can hand out, or less if a control group, such as a container, allows less.
+    """
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        lines = (root / "proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return None
-    kib = (int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    return next((1024 * number for number in kib), None)
+    free = [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return min([*free, *_allowed_by_groups(root)], default=None)
+
+
+def _allowed_by_groups(root: Path) -> Iterator[int]:
+    """Yield the bytes that the control group (version 2) of this process, and each around it, still allow."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text(errors="surrogateescape").splitlines()
+    except OSError:
+        return
+    for group in (Path(line.removeprefix("0::/")) for line in lines if line.startswith("0::/")):
+        for folder in (root / "sys/fs/cgroup" / part for part in (group, *group.parents)):
+            try:
+                limit, used, statistics = (
+                    (folder / f"memory.{name}").read_text() for name in ("max", "current", "stat")
+                )
+                by_name = dict(line.split() for line in statistics.splitlines())
+                # Files that were read count as used, until their memory is needed.
+                yield max(0, int(limit) - int(used) + int(by_name.get("inactive_file", 0)))
+            except (OSError, ValueError):  # the outermost group has no limit, others may have "max"
+                continue
