@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 _LOG = logging.getLogger(__name__)
@@ -15,21 +15,23 @@ _LOG = logging.getLogger(__name__)
 _TURN_S = 0.1
 
 
-def deferred_interrupts() -> AbstractContextManager[None]:
+@contextmanager
+def deferred_interrupts() -> Iterator[None]:
     """Defer Ctrl-C within the block to its end.
 
     For imports of libraries, which would leave a module half initialised or end the process, and for short
     work without which longer work would be lost.
     """
-    return _noted_interrupts(at_once=False)
+    pressed = False
 
+    def note() -> None:
+        nonlocal pressed
+        pressed = True
 
-def reraised_interrupts() -> AbstractContextManager[None]:
-    """Raise KeyboardInterrupt on Ctrl-C within the block and, if it is caught there, again at its end.
-
-    A fit catches it, and ends early with the result so far.
-    """
-    return _noted_interrupts(at_once=True)
+    with _on_signal(signal.SIGINT, note):
+        yield
+    if pressed:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -79,22 +81,6 @@ def terminations_as_interrupts() -> Iterator[Callable[[], None]]:
     with _on_signal(signal.SIGTERM, interrupt):
         yield raise_if_asked
     raise_if_asked()
-
-
-@contextmanager
-def _noted_interrupts(at_once: bool) -> Iterator[None]:
-    pressed = False
-
-    def note() -> None:
-        nonlocal pressed
-        pressed = True
-        if at_once:
-            raise KeyboardInterrupt
-
-    with _on_signal(signal.SIGINT, note):
-        yield
-    if pressed:
-        raise KeyboardInterrupt
 
 
 @contextmanager

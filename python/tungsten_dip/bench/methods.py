@@ -204,6 +204,8 @@ def _ours(
     def run(repeat: int, progress: Progress) -> list[Outcome]:
         start = time.perf_counter()
         result = denoise(bench_set.buffers, settings, progress)
+        if result.interrupted:
+            raise KeyboardInterrupt  # the fit ended early, which is no measurement
         return [Outcome(label, result.color, time.perf_counter() - start, result.iterations)]
 
     shown = (label,) if pictured else ()

@@ -17,7 +17,6 @@ from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.read import read_image
 from tungsten_dip.buffers.render_buffers import FloatImage
 from tungsten_dip.errors import InputError
-from tungsten_dip.interrupts import reraised_interrupts
 from tungsten_dip.progress import Progress, part_of
 from tungsten_dip.report.metrics import compare
 
@@ -65,8 +64,7 @@ class Runner:
             start, end = index / len(tasks), (index + 1) / len(tasks)
             part = part_of(progress, start, end, task.method.labels[-1])
             part(0, task.bench_set.name)
-            with reraised_interrupts():
-                outcomes = task.method.run(task.repeat, part)
+            outcomes = task.method.run(task.repeat, part)
             if task.repeat == 0:
                 for outcome in outcomes:
                     write_image(self._image_path(task.bench_set, outcome.label), outcome.image)
