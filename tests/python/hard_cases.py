@@ -94,7 +94,7 @@ def measure(result: FitResult, damaged: Damaged, undamaged: FitResult | None = N
         finite &= bool(np.isfinite(error).all() and (error >= 0).all())
     if not finite:
         return Outcome(False)
-    truth, noisy = damaged.reference, sanitize(damaged.buffers)[0].color.mean
+    truth, noisy = damaged.reference, sanitize(damaged.buffers, 1)[0].color.mean
     good, far = ~damaged.bad, out_of_reach(damaged.bad)
     drift = harm = None
     most_drift = MOST_DRIFT

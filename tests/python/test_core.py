@@ -116,7 +116,7 @@ def test_sane_buffers_are_shared(render: SyntheticRender) -> None:
             if buffer is not render.buffers.normal:
                 np.maximum(array, 0, out=array)
             array.flags.writeable = False
-    mended, lines = sanitize(render.buffers)
+    mended, lines = sanitize(render.buffers, 2)
     assert lines == ()
     for (_, before), (_, after) in zip(render.buffers.quantities(), mended.quantities(), strict=True):
         for (_, old), (_, new) in zip(before.planes(), after.planes(), strict=True):
@@ -138,7 +138,7 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
     albedo.variance[4:6] = np.inf
     before = _frozen_bytes(buffers)
 
-    mended, lines = sanitize(buffers)
+    mended, lines = sanitize(buffers, 2)
 
     assert _frozen_bytes(buffers) == before
     color_line, albedo_line = (next(line for line in lines if name in line) for name in ("color", "albedo"))
@@ -150,17 +150,17 @@ def test_defects_are_mended_counted_and_not_in_place(render: SyntheticRender) ->
     assert mended.color.half_a is color.half_a
     for _, buffer in mended.quantities():
         assert all(np.isfinite(array).all() for _, array in buffer.planes())
-    assert sanitize(mended)[1] == ()
+    assert sanitize(mended, 2)[1] == ()
 
 
 def test_alpha_is_mended_where_it_is_not_finite_and_keeps_a_filters_lobes(render: SyntheticRender) -> None:
     alpha = np.ones((*render.reference.shape[:2], 1), np.float32)
     alpha[0, 0], alpha[0, 1] = -0.1, 1.2
-    assert sanitize(replace(render.buffers, alpha=alpha))[0].alpha is alpha
+    assert sanitize(replace(render.buffers, alpha=alpha), 2)[0].alpha is alpha
     damaged = alpha.copy()
     damaged[5, 5], damaged[9, 9], damaged[9, 10] = np.nan, np.inf, -np.inf
     before = damaged.tobytes()
-    mended, lines = sanitize(replace(render.buffers, alpha=damaged))
+    mended, lines = sanitize(replace(render.buffers, alpha=damaged), 2)
     assert mended.alpha is not None
     np.testing.assert_array_equal(mended.alpha, alpha)
     assert [line for line in lines if "alpha" in line] == ["repaired alpha 1 NaN, 2 infinite"]
@@ -175,7 +175,7 @@ def test_the_plane_that_was_mended_is_named(plane: str, told: str, render: Synth
     assert depth is not None
     planes = {name: np.maximum(array, 0) for name, array in depth.planes()}
     planes[plane][3, 4] = np.nan
-    _, lines = sanitize(RenderBuffers(render.buffers.color, depth=Buffer(**planes)))
+    _, lines = sanitize(RenderBuffers(render.buffers.color, depth=Buffer(**planes)), 2)
     assert lines == (f"repaired {told} 1 NaN",)
 
 
@@ -187,10 +187,10 @@ def test_a_depth_that_is_negative_everywhere_changes_its_sign(sky: float, render
     ahead = [np.where(depth.mean > 0.1, array, 0) for array in (depth.mean, *depth.halves)]
     behind = Buffer(*(np.where(array == 0, np.float32(sky), -array) for array in ahead), depth.variance)
     before = _frozen_bytes(buffers := render.buffers.with_quantities(depth=behind))
-    mended, lines = sanitize(buffers)
+    mended, lines = sanitize(buffers, 2)
     assert lines[0] == "changed the sign of the depth, which was negative everywhere"
     assert len(lines) == (2 if sky else 1)
-    expected, _ = sanitize(render.buffers.with_quantities(depth=Buffer(*ahead, depth.variance)))
+    expected, _ = sanitize(render.buffers.with_quantities(depth=Buffer(*ahead, depth.variance)), 2)
     assert mended.depth is not None
     assert expected.depth is not None
     if not np.isnan(sky):  # which is rebuilt from the depth around
@@ -202,7 +202,7 @@ def test_a_depth_that_is_negative_everywhere_changes_its_sign(sky: float, render
 def test_a_depth_of_both_signs_is_mended_where_it_is_negative() -> None:
     color = np.ones((2, 3, 3), np.float32)
     depth = np.array([[-1, -2, 0], [-3, np.nan, 4]], np.float32)[..., None]
-    mended, lines = sanitize(RenderBuffers(Buffer(color), depth=Buffer(depth)))
+    mended, lines = sanitize(RenderBuffers(Buffer(color), depth=Buffer(depth)), 2)
     assert lines == ("repaired depth 1 NaN, 3 negative",)
     assert mended.depth is not None
     assert (mended.depth.mean >= 0).all()
@@ -217,7 +217,7 @@ def test_what_negative_lobes_lack_comes_from_the_light_around(render: SyntheticR
         for name, plane in render.buffers.color.planes()
     }
     buffers = render.buffers.with_quantities(color=Buffer(**planes))
-    mended, _ = sanitize(buffers)
+    mended, _ = sanitize(buffers, 2)
     for name in ("mean", "half_a", "half_b"):
         before, after = getattr(buffers.color, name), getattr(mended.color, name)
         assert (before < 0).any()
@@ -229,7 +229,7 @@ def test_without_halves_the_neighbours_tell() -> None:
     mean = np.full((3, 3, 3), 2, np.float32)
     variance = np.full((3, 3, 3), 0.5, np.float32)
     mean[1, 1], variance[1, 1], variance[0, 0] = np.inf, np.nan, 0.75
-    mended, lines = sanitize(RenderBuffers(color=Buffer(mean, variance=variance)))
+    mended, lines = sanitize(RenderBuffers(color=Buffer(mean, variance=variance)), 2)
     assert lines == ("repaired color 3 infinite; color variance 3 NaN",)
     np.testing.assert_array_equal(mended.color.mean, 2)
     assert mended.color.variance is not None
@@ -241,11 +241,11 @@ def test_every_size_passes_through_everything(shape: tuple[int, int]) -> None:
     color = _noisy_color(*shape).color
     normal = Buffer(color.mean - 5, color.half_a, color.half_b, color.variance)
     nowhere = Buffer(np.full((*shape, 1), np.nan, np.float32))
-    buffers, lines = sanitize(RenderBuffers(color=color, normal=normal, depth=nowhere))
+    buffers, lines = sanitize(RenderBuffers(color=color, normal=normal, depth=nowhere), 2)
     assert lines == ((f"repaired depth {shape[0] * shape[1]} NaN",) if shape[0] * shape[1] else ())
     assert buffers.depth is not None
     np.testing.assert_array_equal(buffers.depth.mean, np.zeros((*shape, 1)))
-    filtered = prefilter_features(buffers)
+    filtered = prefilter_features(buffers, 2)
     assert filtered.normal is not None
     assert all(
         np.isfinite(array).all() and array.shape == (*shape, 3) for _, array in filtered.normal.planes()
@@ -253,25 +253,25 @@ def test_every_size_passes_through_everything(shape: tuple[int, int]) -> None:
     assert filtered.depth is not None
     np.testing.assert_array_equal(filtered.depth.mean, buffers.depth.mean)
     assert filtered.depth.halves is None
-    assert compare_halves(buffers).independent == (shape == (65, 67))
+    assert compare_halves(buffers, 2).independent == (shape == (65, 67))
 
 
 def test_independence_is_told_from_mirrored_and_copied_halves() -> None:
-    independent = compare_halves(_noisy_color(96, 80))
+    independent = compare_halves(_noisy_color(96, 80), 2)
     assert independent.independent
     assert abs(independent.correlation) < 0.1
 
-    mirrored = compare_halves(_noisy_color(96, 80, mirror=0.5))
+    mirrored = compare_halves(_noisy_color(96, 80, mirror=0.5), 2)
     assert not mirrored.independent
     assert mirrored.correlation == pytest.approx(-0.5, abs=0.1)
 
     color = _noisy_color(96, 80).color
     copied = compare_halves(
-        RenderBuffers(color=Buffer(color.mean, color.half_a, color.half_a, color.variance))
+        RenderBuffers(color=Buffer(color.mean, color.half_a, color.half_a, color.variance)), 2
     )
     assert (copied.independent, copied.correlation) == (False, 1.0)
 
-    alone = compare_halves(RenderBuffers(color=Buffer(color.mean, variance=color.variance)))
+    alone = compare_halves(RenderBuffers(color=Buffer(color.mean, variance=color.variance)), 2)
     assert not alone.independent
     assert np.isnan(alone.correlation)
 
@@ -283,7 +283,7 @@ def test_prefiltering_removes_noise_and_changes_nothing_else() -> None:
     clean = Buffer(truth.normal.mean, truth.normal.mean, truth.normal.mean, np.zeros_like(truth.normal.mean))
     buffers = noisy.with_quantities(normal=clean)
     before = _frozen_bytes(buffers)
-    filtered = prefilter_features(buffers)
+    filtered = prefilter_features(buffers, 2)
     assert _frozen_bytes(buffers) == before
     assert filtered.color is buffers.color
     assert filtered.normal is not None
@@ -302,7 +302,7 @@ def test_a_mean_below_its_halves_does_not_become_negative() -> None:
     half = np.zeros((20, 24, 3), np.float32)
     half[10, 12] = 1
     feature = Buffer(0 * half, half, half, np.full_like(half, 0.25))
-    filtered = prefilter_features(RenderBuffers(feature, albedo=feature, normal=feature))
+    filtered = prefilter_features(RenderBuffers(feature, albedo=feature, normal=feature), 2)
     assert filtered.albedo is not None
     assert filtered.normal is not None
     assert filtered.normal.mean[10, 12].max() < -0.5
@@ -323,7 +323,7 @@ def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:
     samples = (rng.uniform(size=(4, 64, 48, 3)) < 0.5).astype(np.float32)
     half_a, half_b = samples[::2].mean(axis=0), samples[1::2].mean(axis=0)
     albedo = Buffer((half_a + half_b) / 2, half_a, half_b, samples.var(axis=0, ddof=1) / 4)
-    filtered = prefilter_features(RenderBuffers(albedo, albedo=albedo)).albedo
+    filtered = prefilter_features(RenderBuffers(albedo, albedo=albedo), 2).albedo
     assert filtered is not None
     one_pass = _core.prefilter_feature(
         albedo.mean, half_a, half_b, albedo.variance, radius=5, step=1, k=0.5, threads=2
@@ -335,7 +335,7 @@ def test_what_samples_of_two_kinds_leave_is_evened_out() -> None:
 
 def test_of_a_feature_without_halves_no_remaining_noise_is_claimed() -> None:
     noisy = np.random.default_rng(8).normal(0.5, 0.05, (30, 40, 3)).astype(np.float32)
-    filtered = prefilter_features(RenderBuffers(Buffer(noisy), albedo=Buffer(noisy))).albedo
+    filtered = prefilter_features(RenderBuffers(Buffer(noisy), albedo=Buffer(noisy)), 2).albedo
     assert filtered is not None
     assert filtered.variance is None
     assert filtered.halves is None

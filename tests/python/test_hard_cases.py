@@ -80,7 +80,7 @@ def test_every_way_stays_finite(way: str, case: HardCase, undamaged: FitResult) 
 def test_halves_are_tested_alike_at_any_exposure(exponent: int) -> None:
     (case,) = (case for case in CASES if case.name == "halves correlated, +0.5")
     buffers = case.make().buffers
-    here, there = compare_halves(buffers), compare_halves(exposed(buffers, exponent))
+    here, there = (compare_halves(image, 1) for image in (buffers, exposed(buffers, exponent)))
     assert here.correlation == pytest.approx(there.correlation)
     assert not here.independent
     assert not there.independent
@@ -170,7 +170,7 @@ def _check_gradient(parameter, gradient, loss: Callable[[], float], entries: int
 
 def test_a_depth_around_0_does_not_fall_below_it() -> None:
     buffers = synthetic_render(3, 2, 4).buffers.with_quantities(albedo=None, normal=None)
-    depth = prefilter_features(sanitize(buffers)[0]).depth
+    depth = prefilter_features(sanitize(buffers, 1)[0], 1).depth
     assert depth is not None
     assert depth.mean.min() >= 0
     assert np.isfinite(denoise(buffers, replace(DRAFT, iterations=2)).color).all()

@@ -9,7 +9,6 @@ import numpy as np
 from tungsten_dip import _core
 from tungsten_dip._core import HalvesTest
 from tungsten_dip.buffers.render_buffers import FEATURES, Buffer, RenderBuffers
-from tungsten_dip.cores import thread_count
 
 __all__ = [
     "HalvesTest",
@@ -35,7 +34,7 @@ paths lost in glass do not reach. Where the image of a single light is mistaken 
 _ENOUGH_PIXELS = 1 << 14
 
 
-def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> HalvesTest:
+def compare_halves(buffers: RenderBuffers, threads: int) -> HalvesTest:
     """Test whether the noise of the colour's halves is independent, as scoring one by the other assumes.
 
     Halves of a low-discrepancy sampler mirror each other (Tungsten's Sobol sampler: correlation -0.2), and
@@ -50,7 +49,7 @@ def compare_halves(buffers: RenderBuffers, threads: int | None = None) -> Halves
     half_a, half_b = color.halves
     if isinstance(buffers.spp, np.ndarray) and not buffers.spp.all():
         half_a, half_b = (np.where(buffers.spp > 0, half, np.float32(np.nan)) for half in color.halves)
-    return _core.compare_halves(half_a, half_b, color.variance, thread_count(threads))
+    return _core.compare_halves(half_a, half_b, color.variance, threads)
 
 
 def without_single_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple[str, ...]]:
@@ -89,9 +88,7 @@ def without_foreign_halves(buffers: RenderBuffers) -> tuple[RenderBuffers, tuple
     return buffers.with_quantities(**alone), lines
 
 
-def without_foreign_variance(
-    buffers: RenderBuffers, threads: int | None = None
-) -> tuple[RenderBuffers, tuple[str, ...]]:
+def without_foreign_variance(buffers: RenderBuffers, threads: int) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Return buffers without a variance of the colour that its halves contradict, and a line on it.
 
     It is that of one sample, say, or of another unit. Expects sanitised buffers.

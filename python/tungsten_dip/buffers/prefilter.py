@@ -8,7 +8,6 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import FEATURES, TRAITS, Buffer, FloatImage, RenderBuffers
-from tungsten_dip.cores import thread_count
 
 _PASSES = ((3, 1, 0.35), (4, 2, 0.5), (5, 1, 0.7))
 """Radius and step of the window, and standard deviations that pixels may differ by: what one pass leaves is
@@ -16,13 +15,10 @@ compared with less noise by the next, which may look further and average more. A
 few samples are still noisy at the edges of lights and in mirrors."""
 
 
-def prefilter_features(buffers: RenderBuffers, threads: int | None = None) -> RenderBuffers:
-    """Return sanitised buffers with every feature filtered as guide of a regression; see `prefilter_feature`.
-
-    ``threads`` None uses every core.
-    """
+def prefilter_features(buffers: RenderBuffers, threads: int) -> RenderBuffers:
+    """Return sanitised buffers with every feature filtered to guide a regression (`prefilter_feature`)."""
     filtered = {
-        name: prefilter_feature(feature, _PASSES, thread_count(threads), signed=TRAITS[name].signed)
+        name: prefilter_feature(feature, _PASSES, threads, signed=TRAITS[name].signed)
         for name in FEATURES
         if (feature := buffers.get(name)) is not None
     }

@@ -8,12 +8,11 @@ import numpy as np
 
 from tungsten_dip import _core
 from tungsten_dip.buffers.render_buffers import Buffer, FloatImage, RenderBuffers
-from tungsten_dip.cores import thread_count
 
 _PLANES = ("", " half A", " half B", " variance")
 
 
-def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[RenderBuffers, tuple[str, ...]]:
+def sanitize(buffers: RenderBuffers, threads: int) -> tuple[RenderBuffers, tuple[str, ...]]:
     """Repair NaN, infinite and negative values; return buffers and a log line per repaired quantity.
 
     No radiance below 1e36 is clamped. Negative values become 0 (normals may be negative; a depth that is
@@ -22,7 +21,7 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
     Everything else, also normals of 1e6 and an albedo of 1e12 and more, is rebuilt: the mean and the halves
     from one another, a variance from the halves, and what remains from the valid pixels around it or, far
     from any, from the half that is valid. Of alpha, NaN and Inf alone are repaired (`finite_alpha`). Arrays
-    without defects are shared with ``buffers``, which are not modified. ``threads`` None uses every core.
+    without defects are shared with ``buffers``, which are not modified.
     """
     repaired: dict[str, Buffer | None] = {}
     lines = []
@@ -31,7 +30,7 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
         lines.append("changed the sign of the depth, which was negative everywhere")
     for quantity, buffer in buffers.quantities():
         planes, defects = _core.sanitize(
-            quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, thread_count(threads)
+            quantity, buffer.mean, buffer.half_a, buffer.half_b, buffer.variance, threads
         )
         found = [
             f"{quantity}{plane} {_counts(counts)}"
@@ -49,14 +48,14 @@ def sanitize(buffers: RenderBuffers, threads: int | None = None) -> tuple[Render
     return buffers.with_quantities(**repaired), tuple(lines)
 
 
-def finite_alpha(alpha: FloatImage, threads: int | None = None) -> tuple[FloatImage, str]:
+def finite_alpha(alpha: FloatImage, threads: int) -> tuple[FloatImage, str]:
     """Return an alpha, shape (height, width, 1), rebuilt where it is NaN or infinite, and how many values.
 
     1e6 and more counts as infinite. What a filter's lobes leave below 0 or above 1 stays. Without defects,
     ``alpha`` itself is returned, and an empty text.
     """
     # The rules of normals hold for it, too.
-    (finite, *_), (defects, *_) = _core.sanitize("normal", alpha, None, None, None, thread_count(threads))
+    (finite, *_), (defects, *_) = _core.sanitize("normal", alpha, None, None, None, threads)
     return finite, _counts(defects)
 
 

@@ -33,6 +33,7 @@ from tungsten_dip.buffers.render_buffers import (
 )
 from tungsten_dip.buffers.sanitize import finite_alpha
 from tungsten_dip.buffers.source import ADDED, FRAME, MAP, MOVED_TO, OWN, SPP, Channel, Part, Source
+from tungsten_dip.cores import thread_count
 from tungsten_dip.errors import InputError
 
 _DENOISED_PART = "tungsten_dip denoised"
@@ -64,7 +65,7 @@ def write_layers(
     single = len(source.parts) == 1
     kept = source.parts[0].channels if single else {}
     if buffers.alpha is not None:
-        alpha, defects = finite_alpha(buffers.alpha, threads)
+        alpha, defects = finite_alpha(buffers.alpha, thread_count(threads))
         if defects or "A" not in kept:
             added["A"] = alpha[..., 0]
     moved_to = "noisy"

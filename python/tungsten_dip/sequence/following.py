@@ -104,6 +104,7 @@ class Follower:
         check_ready(settings, self.models.alone)
         self._settings = settings
         self._refit = checked_refit(refit)
+        self._threads = thread_count(settings.threads)
         self._last: _Last | None = None
         self._error: float | None = None
         self._told_of_depth = False
@@ -156,8 +157,7 @@ class Follower:
     def _with_smooth_albedo(self, buffers: RenderBuffers) -> RenderBuffers:
         if buffers.albedo is None:
             return buffers
-        threads = thread_count(self._settings.threads)
-        albedo = prefilter_feature(buffers.albedo, _ALBEDO_PASSES, threads)
+        albedo = prefilter_feature(buffers.albedo, _ALBEDO_PASSES, self._threads)
         return buffers.with_quantities(albedo=albedo)
 
     def _follow(
@@ -173,7 +173,7 @@ class Follower:
         features = _features(buffers)
         if None not in (features, self.models.features) and features != self.models.features:
             raise _CutError("the frames before had other features")
-        moved = None if last is None else _moved(last, smooth, camera, self._settings.threads)
+        moved = None if last is None else _moved(last, smooth, camera, self._threads)
         if moved is not None and float(np.isfinite(moved[0][:, :, 0]).mean()) < _LEAST_IN_SIGHT:
             raise _CutError("the previous frame shows little of this one")
         model = self.models.alone if moved is None else self.models.following
@@ -229,13 +229,13 @@ def _is_new(network: Model | None, model: Model | None) -> bool:
     return network is not None and (model is None or network.blend is not model.blend)
 
 
-def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int | None) -> Halves | None:
+def _moved(last: _Last, buffers: RenderBuffers, camera: Camera | None, threads: int) -> Halves | None:
     """Return what the last frame shows of this one, None where that is not known."""
     if camera is None or last.camera is None or last.result.halves is None:
         return None
     if buffers.depth is None or last.buffers.depth is None:
         return None
-    return reproject(last.result.halves, last.smooth, last.camera, buffers, camera, thread_count(threads))
+    return reproject(last.result.halves, last.smooth, last.camera, buffers, camera, threads)
 
 
 def _typical_error(result: FitResult) -> float | None:

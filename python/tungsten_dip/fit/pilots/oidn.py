@@ -53,6 +53,7 @@ def oidn_image(
         for name, image in (("color", color), ("albedo", albedo), ("normal", normal))
         if image is not None
     }
+    threads = thread_count(threads)
     repaired, _ = sanitize(RenderBuffers(**given), threads)
     images: dict[str, FloatImage] = {name: buffer.mean for name, buffer in repaired.quantities()}
     images["output"] = np.empty_like(images["color"])
@@ -62,7 +63,7 @@ def oidn_image(
         "high": pyoidn.OIDN_QUALITY_HIGH,
     }
     with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
-        device.set_int("numThreads", thread_count(threads))
+        device.set_int("numThreads", threads)
         device.commit()
         with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT) as denoiser:
             for name, image in images.items():

@@ -46,7 +46,7 @@ class Prepared:
 
 
 def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
-    """Check and sanitise the input.
+    """Check and sanitise the input; ``threads`` None uses every core.
 
     An albedo in another scale and a variance of something else are left out, halves that are lost are drawn,
     and gaps between samples are filled.
@@ -60,13 +60,14 @@ def prepare_input(buffers: RenderBuffers, threads: int | None) -> Prepared:
         _LOG.warning(
             "the colour is NaN or Inf in every pixel: the result will be nearly empty; render it again"
         )
+    threads = thread_count(threads)
     buffers, single = without_single_halves(buffers)
     buffers, foreign = without_foreign_halves(buffers)
     rendered = buffers.color
     buffers, repaired = sanitize(buffers, threads)
     buffers = _without_albedo_of_another_scale(buffers)
-    buffers, lost = _without_lost_halves(buffers, rendered, thread_count(threads))
-    buffers, gaps = _with_gaps_filled(buffers, thread_count(threads))
+    buffers, lost = _without_lost_halves(buffers, rendered, threads)
+    buffers, gaps = _with_gaps_filled(buffers, threads)
     buffers, variance = without_foreign_variance(buffers, threads)
     return Prepared(buffers, (*single, *foreign, *repaired, *lost, *gaps, *variance))
 
