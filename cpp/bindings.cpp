@@ -75,8 +75,8 @@ py::tuple sanitize(const std::string& quantity_name, const py::array& mean, cons
                    const OptionalArray& half_b, const OptionalArray& variance, int threads) {
     const std::optional<Quantity> quantity = quantity_from_name(quantity_name);
     if (!quantity) {
-        throw py::value_error("quantity: expected color, albedo, normal, depth or visibility, got " +
-                              quantity_name);
+        throw py::value_error(py::str("quantity: expected one of {}, got {}")
+                                  .format(py::str(", ").attr("join")(quantity_names), quantity_name));
     }
     const ConstBuffer buffer = buffer_from_arrays(mean, half_a, half_b, variance);
     BufferDefects defects;

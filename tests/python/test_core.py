@@ -92,7 +92,7 @@ def test_shapes_must_agree() -> None:
         _core.sanitize("color", image, other, None, None, 2)
     with pytest.raises(TypeError, match=r"^half_a: expected an aligned"):
         _core.compare_halves(image.astype(np.float64), image, None, 2)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="quantity: expected color, albedo"):
+    with pytest.raises(ValueError, match=f"^quantity: expected one of {', '.join(TRAITS)}, got colour$"):
         _core.sanitize("colour", image, None, None, None, 2)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from tungsten_dip.buffers.render_buffers import (
     CHANNELS,
+    FEATURES,
     MOST_SPP,
     Buffer,
     FloatImage,
@@ -35,7 +36,7 @@ from tungsten_dip.scene.types import Scene
 
 _LOG = logging.getLogger(__name__)
 
-QUANTITIES: tuple[Quantity, ...] = ("color", "albedo", "normal", "depth")
+QUANTITIES: tuple[Quantity, ...] = ("color", *FEATURES)
 """What is rendered unless something else is asked for; colour is always there."""
 
 _TRACE_SETTINGS = (
