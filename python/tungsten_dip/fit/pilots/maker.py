@@ -138,13 +138,12 @@ def _regress(
     guide: FloatImage | None = None,
     guide_variance: FloatImage | None = None,
 ) -> FloatImage:
-    features = surfaces.features
-    penalty = surfaces.penalty if pilot.k is None else surfaces.guided_penalty
+    features, penalty = surfaces.features, surfaces.guided_penalty
+    if pilot.k is None:
+        penalty, guide, guide_variance = surfaces.penalty, None, None
     if pilot.with_position:
         features = np.concatenate((features, _positions(image.shape)), axis=2)
         penalty = (*penalty, 0.0, 0.0)
-    if pilot.k is None:
-        return _core.regress(image, features, penalty, radius=pilot.radius, step=pilot.step, threads=threads)
     return _core.regress(
         image,
         features,
@@ -153,7 +152,7 @@ def _regress(
         guide_variance,
         radius=pilot.radius,
         step=pilot.step,
-        k=pilot.k,
+        k=pilot.k or 1.0,  # of no use without a guide
         threads=threads,
     )
 
