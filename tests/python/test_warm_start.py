@@ -190,7 +190,7 @@ def test_the_commands_of_the_base_installation_do_without_torch(
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "told"), [("--refit", "-1", "--refit: "), ("--threads", "0", "threads: ")]
+    ("option", "value", "told"), [("--refit", "-1", "refit_steps: "), ("--threads", "0", "threads: ")]
 )
 def test_numbers_that_infer_cannot_take_are_told_before_anything_is_read(
     option: str, value: str, told: str, saved: Path, capfd: pytest.CaptureFixture[str]

@@ -21,6 +21,7 @@ from tungsten_dip.fit.paper.constants import ITERATIONS
 from tungsten_dip.fit.pilots.oidn import Quality, oidn_image
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings, Preset
 from tungsten_dip.hosts import render
+from tungsten_dip.hosts.options import checked_option
 from tungsten_dip.progress import Progress
 from tungsten_dip.scene.parse import load_scene
 
@@ -101,7 +102,8 @@ class Plan:
                 raise InputError(f"presets: expected some of {', '.join(OUR_PRESETS)}, got {preset}")
         for name in ("repeats", "paper_iterations"):
             object.__setattr__(self, name, whole_number(name, getattr(self, name), 1, MOST_ITERATIONS))
-        FitSettings(threads=self.threads)  # which checks them
+        if self.threads is not None:
+            object.__setattr__(self, "threads", checked_option("threads", self.threads))
 
 
 def methods_for(sets: Sequence[BenchSet], plan: Plan) -> dict[str, list[Method]]:

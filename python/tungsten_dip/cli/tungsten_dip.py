@@ -45,10 +45,10 @@ from tungsten_dip.cli.denoising import (
 )
 from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.cli.sequence import add_sequence
-from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.settings import MOST_ITERATIONS, PAPER_SETTINGS, FitSettings, Inputs, Preset
+from tungsten_dip.fit.settings import PAPER_SETTINGS, FitSettings, Inputs, Preset
 from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.interrupts import deferred_interrupts
 from tungsten_dip.remarks import remarks_from_log
@@ -169,17 +169,16 @@ def _denoise(options: argparse.Namespace) -> Outcome:
 
 
 def _infer(options: argparse.Namespace) -> Outcome:
-    whole_number("--refit", options.refit, 0, MOST_ITERATIONS)
     if options.save_model is not None and options.refit == 0:
         raise InputError(
             f"--save-model: without --refit the network is that of {options.model} still; add --refit N or "
             f"omit --save-model"
         )
     with deferred_interrupts():
-        from tungsten_dip.onnx.inference import inference_settings
+        from tungsten_dip.onnx.inference import checked_settings
 
     model = tungsten_dip.load_model(options.model)
-    inference_settings(model, options.threads, options.refit)  # which checks them, before anything is read
+    checked_settings(model, options.threads, options.refit)  # before anything is read
 
     def infer(buffers: RenderBuffers) -> FitResult:
         with progress_on_stderr("denoising") as progress:

@@ -44,7 +44,7 @@ def infer(
     refit_steps cannot be done.
     """
     check_type("model", model, Model, "load_model reads one from a file")
-    settings = inference_settings(model, threads, refit_steps)
+    settings = checked_settings(model, threads, refit_steps)
     prepared = prepare_input(buffers, threads)
     if model.is_paper:
         result = _infer_paper(model, prepared.buffers, settings, progress)
@@ -55,7 +55,7 @@ def infer(
     return finish_result(result, prepared)
 
 
-def inference_settings(model: Model, threads: int | None, refit_steps: int) -> FitSettings:
+def checked_settings(model: Model, threads: int | None, refit_steps: int) -> FitSettings:
     """Return the settings that a model is used with, for the arguments of `infer`.
 
     Raises InputError if these cannot be done, or a package is missing.

@@ -22,7 +22,7 @@ from tungsten_dip.extras import require
 from tungsten_dip.interrupts import terminations_as_interrupts
 from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
-from tungsten_dip.sequence.following import Follower, Models
+from tungsten_dip.sequence.following import Models, check_can_follow
 from tungsten_dip.sequence.frames import Frame
 from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
 
@@ -70,7 +70,7 @@ def denoise_on_cluster(
 
     Raises InputError if Dask is not installed, the scheduler does not answer or local workers do not start.
     """
-    Follower(run.settings, run.refit, models)  # which checks them, before any worker starts
+    check_can_follow(run.settings, models.alone)  # before any worker starts
     frames = [_absolute(frame) for frame in frames]
     to_do, records = split_finished(frames, run)
     for record in records:

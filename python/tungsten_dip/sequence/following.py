@@ -17,7 +17,7 @@ import numpy as np
 from tungsten_dip.buffers.prefilter import prefilter_feature
 from tungsten_dip.buffers.render_buffers import FEATURES, Halves, RenderBuffers
 from tungsten_dip.cores import thread_count
-from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.errors import InputError
 from tungsten_dip.fit import check_ready
 from tungsten_dip.fit.blending import fit_blend
 from tungsten_dip.fit.inference import infer_blend
@@ -26,7 +26,7 @@ from tungsten_dip.fit.pilots.surfaces import alpha_as_albedo
 from tungsten_dip.fit.preparation.prepare import finish_result, prepare_input
 from tungsten_dip.fit.presets import STEPS_OF_ONE_NETWORK
 from tungsten_dip.fit.result import FitResult
-from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
+from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.progress import Progress, silent
 from tungsten_dip.scene.types import Camera
 from tungsten_dip.sequence.flicker import estimated_flicker
@@ -81,12 +81,15 @@ class _Last:
     result: FitResult
 
 
-def checked_refit(refit: Refit) -> Refit:
-    """Return "auto" or a number of steps, as Python's own.
+def check_can_follow(settings: FitSettings, warm_start: Model | None) -> None:
+    """Raise InputError if no frames can be denoised with these settings, from the network of ``warm_start``.
 
-    Raises InputError if it is neither.
+    The settings may be those of the published method, which has no halves to follow, ask for another network
+    than this one, or for a device that is not there.
     """
-    return refit if refit == "auto" else whole_number("refit, unless auto", refit, 0, MOST_ITERATIONS)
+    if settings.preset == "paper":
+        raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
+    check_ready(settings, warm_start)
 
 
 class Follower:
@@ -95,15 +98,12 @@ class Follower:
     def __init__(self, settings: FitSettings, refit: Refit = "auto", models: Models = Models()) -> None:
         """``refit``: how many steps a frame's network is trained further, "auto" for what its error asks.
 
-        Raises InputError if the settings are those of the published method, which has no halves to follow,
-        ask for another network than these or a device that is not there, or refit is out of range.
+        Raises InputError as `check_can_follow` does.
         """
-        if settings.preset == "paper":
-            raise InputError("preset paper: expected draft, balanced or final; frames of it do not follow")
+        check_can_follow(settings, models.alone)
         self.models = models
-        check_ready(settings, self.models.alone)
         self._settings = settings
-        self._refit = checked_refit(refit)
+        self._refit = refit
         self._threads = thread_count(settings.threads)
         self._last: _Last | None = None
         self._error: float | None = None

@@ -17,12 +17,12 @@ from typing import Any, Literal
 
 from tungsten_dip.buffers.image_file import is_whole, read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
-from tungsten_dip.errors import InputError
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.progress import Progress, part_of, silent
 from tungsten_dip.scene.parse import load_camera
-from tungsten_dip.sequence.following import Follower, How, Models, Refit, checked_refit
+from tungsten_dip.sequence.following import Follower, How, Models, Refit
 from tungsten_dip.sequence.frames import RECORD, Frame
 
 _LOG = logging.getLogger(__name__)
@@ -48,7 +48,9 @@ class Run:
     warm_start_sha256: str | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "refit", checked_refit(self.refit))
+        if self.refit != "auto":
+            steps = whole_number("refit, unless auto", self.refit, 0, MOST_ITERATIONS)
+            object.__setattr__(self, "refit", steps)
 
 
 @dataclass(frozen=True)
