@@ -13,6 +13,7 @@ import numpy.typing as npt
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.relmse import RELMSE_EPSILON
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves
+from tungsten_dip.fit.preparation.exposure import BLACK
 
 _Floats = npt.NDArray[np.float64]
 
@@ -24,9 +25,6 @@ _FEW = 6
 
 _STANDARD_ERRORS = 2.0
 """So many standard errors are subtracted from a slope."""
-
-_BLACK = 2e-3
-"""Levels below are compared as black; the median of lit pixels is about 0.25."""
 
 
 def with_lost_detail(halves: Halves, denoised: Halves, drawn: bool = False) -> Halves:
@@ -64,7 +62,7 @@ def with_lost_detail(halves: Halves, denoised: Halves, drawn: bool = False) -> H
 
 
 def _level(image: FloatImage) -> FloatImage:
-    level: FloatImage = channel_mean(image)[..., 0] + np.float32(_BLACK)
+    level: FloatImage = channel_mean(image)[..., 0] + np.float32(BLACK)
     return level
 
 

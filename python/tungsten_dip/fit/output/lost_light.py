@@ -12,6 +12,7 @@ from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of, variance_of_mean
 from tungsten_dip.fit.neighbours import window_pixels
+from tungsten_dip.fit.preparation.exposure import BLACK
 
 _RADIUS = 24
 _STANDARD_ERRORS = 3.0
@@ -21,9 +22,6 @@ _LARGEST_GAIN = 1.25
 
 _LAMP = 16.0
 """Pixels more than so many times brighter than is typical around them are lamps or highlights."""
-
-_BLACK = 2e-3
-"""Added to levels before their logarithm; the median of lit pixels is about 0.25."""
 
 
 def gain_of_lost_light(noisy: Halves, image: FloatImage, threads: int) -> FloatImage:
@@ -39,7 +37,7 @@ def gain_of_lost_light(noisy: Halves, image: FloatImage, threads: int) -> FloatI
         return _core.box_mean(values, _RADIUS, threads)
 
     level = channel_mean(image)
-    typical = np.exp(mean(np.log(level + np.float32(_BLACK))))
+    typical = np.exp(mean(np.log(level + np.float32(BLACK))))
     counted = level <= np.float32(_LAMP) * typical
     missing = np.clip(channel_mean(mean_of(noisy)) - level, -typical, typical) * counted
     variance = mean(channel_mean(variance_of_mean(noisy)) * counted)

@@ -10,6 +10,9 @@ from tungsten_dip.buffers.render_buffers import Buffer, FloatImage
 _TYPICAL_RADIANCE = 0.25
 """Images are scaled so that their lit pixels have about this median: every constant of `fit` relies on it."""
 
+BLACK = 2e-3
+"""Added to levels that are compared by their ratio: what is darker than this counts as black."""
+
 _BRIGHTEST = 1e15
 """Brighter pixels, in these units, count as this bright: the squares of their differences overflow."""
 
