@@ -24,7 +24,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
 }
 """The names of layers, as in `Traits`, of every quantity and of the number of samples."""
 
-_NOISY = ALIASES["color"][:2]
+_NOISY = ("noisy image", "noisy")
 _SHOWN = ("combined", "rgba")
 
 _THREE_CHANNELS = tuple(quantity for quantity, count in CHANNELS.items() if count == 3)
