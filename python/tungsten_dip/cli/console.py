@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
+from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.errors import InputError
 from tungsten_dip.extras import EXTRA_BY_MODULE, requirement
 from tungsten_dip.remarks import logging_to
@@ -99,29 +100,36 @@ def run(command: str, body: Callable[[], None]) -> int:
 
 
 @contextmanager
-def json_on_stdout(enabled: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Keep stdout for one JSON object: all else written there in the block, by libraries too, goes to stderr.
+def outcome_on_stdout(as_json: bool) -> Iterator[Callable[[Outcome], None]]:
+    """Yield the function that prints the outcome of the block: its text or, as JSON, its facts.
 
-    Yields the function that prints the object. Numbers that JSON has no name for (NaN, Inf) become null.
+    JSON is alone on stdout: all else written there in the block, by libraries too, goes to stderr. Numbers
+    that JSON has no name for (NaN, Inf) become null.
     """
-    if not enabled:
-        yield lambda _: None
+    if not as_json:
+        yield lambda outcome: _print(outcome.text)
         return
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)
 
-    def emit(value: dict[str, Any]) -> None:
+    def print_facts(outcome: Outcome) -> None:
         # A plain os.write may write a part, and say so in what it returns alone.
         with os.fdopen(os.dup(stdout), "w", encoding="utf-8") as stream:
-            stream.write(json.dumps(_finite(value), indent=1) + "\n")
+            stream.write(json.dumps(_finite(outcome.facts), indent=1) + "\n")
 
     try:
-        yield emit
+        yield print_facts
     finally:
         sys.stdout.flush()
         os.dup2(stdout, 1)
         os.close(stdout)
+
+
+def _print(text: str) -> None:
+    encoding = sys.stdout.encoding or "utf-8"
+    # Names of files need not be text.
+    print(printable(text).encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 @contextmanager
@@ -182,7 +190,7 @@ def add_threads(parser: argparse._ActionsContainer) -> None:
 
 
 def add_json(parser: argparse._ActionsContainer) -> None:
-    """Add ``--json`` (`json_on_stdout`)."""
+    """Add ``--json`` (`outcome_on_stdout`)."""
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, nothing else")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -23,8 +22,7 @@ from tungsten_dip.cli.console import (
     add_json,
     add_threads,
     integers,
-    json_on_stdout,
-    printable,
+    outcome_on_stdout,
     progress_on_stderr,
     run,
     writing_stdout,
@@ -66,23 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> None:
     options = _parser().parse_args(arguments)
-    with json_on_stdout(options.json) as emit:
+    with outcome_on_stdout(options.json) as tell:
         outcome: Outcome = options.action(options)
         with writing_stdout():
-            if options.json:
-                emit(outcome.facts)
-            else:
-                _print(outcome.text)
+            tell(outcome)
     if outcome.error is not None:
         raise InputError(outcome.error)
     if outcome.interrupted:
         raise KeyboardInterrupt  # what was reached is written; the exit status says that it is not all
-
-
-def _print(text: str) -> None:
-    encoding = sys.stdout.encoding or "utf-8"
-    # Names of files need not be text.
-    print(printable(text).encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
