@@ -2,9 +2,13 @@
 
 If a pixel's value is a sum of many small contributions, gamma-distributed with shape k, and T is drawn from
 Beta(k / 2, k / 2), then 2 T and 2 (1 - T) times the value are as noisy as two halves of the samples, and as
-independent (Neufeld et al. 2024, "Data Thinning for Convolution-Closed Distributions"). Whatever the
-distribution, their noise is uncorrelated if T has the right variance, which is what scoring one by the other
-needs.
+independent (Neufeld et al. 2024, "Data Thinning for Convolution-Closed Distributions"). The shape of such a
+value is its squared mean over its variance, so that
+
+    k = (level of the image around the pixel)^2 / (variance of the noise there).
+
+Whatever the distribution, the noise of both is uncorrelated if T has the right variance, which is what
+scoring one by the other needs. Below, "shape" without more is this k, of Beta.
 """
 
 from __future__ import annotations
@@ -40,8 +44,10 @@ _NOISE_RADIUS = 1
 _CORRELATION_RADIUS = 8
 
 _LEAST_SHAPE = 1e-2
+"""Shapes below count as this one, and so does that of black, which has neither level nor noise."""
+
 _SHAPE_OF_ONE_SAMPLE = 0.07
-"""One half has all of such a pixel, in every channel: a single sample was so bright."""
+"""Where the shape is less, T becomes 0 or 1, in every channel alike: a single sample was so bright."""
 
 _STRAY_OVER_NEIGHBOURS = 8 / 3
 """Emission of more than so many times the mean of the 8 pixels around was hit by chance: a lamp's corner has
@@ -183,25 +189,27 @@ def _share_of_half_a(color: FloatImage, emitted: FloatImage, seed: int, threads:
     image = scaled(color, exposure(Buffer(color)))
     random = np.random.default_rng([seed, int(hashlib.sha256(image.data).hexdigest()[:16], 16)])
     around = _core.box_mean(image, _MEAN_RADIUS, threads)
-    level = around.astype(np.float64) ** 2
+    level_squared = around.astype(np.float64) ** 2
     noise = _noise_around(image, around, threads)
-    level_of_all, noise_of_all = level.sum(axis=2), noise.sum(axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN where all is black
+        beta_shape = level_squared / noise
+        beta_shape_of_all = level_squared.sum(axis=2) / noise.sum(axis=2)
     lit, least_of_lamps = _lamps(channel_mean(emitted), threads)
-    share = _shares(random, level_of_all, noise_of_all, least_of_lamps)[:, :, None].repeat(3, axis=2)
-    one_sample = level_of_all < _SHAPE_OF_ONE_SAMPLE * noise_of_all
+    share = _shares(random, beta_shape_of_all, least_of_lamps)[:, :, None].repeat(3, axis=2)
+    one_sample = beta_shape_of_all < _SHAPE_OF_ONE_SAMPLE
+    # Whether a pixel's channels have a T each is drawn, too: yes with the probability 1 - correlation.
     apart = random.random(lit.shape) >= _correlation(image, around, threads)[:, :, 0]
     apart &= ~lit & ~one_sample
-    share[apart] = _shares(random, level[apart], noise[apart], 0)
+    share[apart] = _shares(random, beta_shape[apart], 0)
     return share
 
 
-def _shares(
-    random: np.random.Generator, level: _Plane, noise: _Plane, least: FloatArray | float
-) -> FloatArray:
-    """Draw T from Beta, for a squared level and a variance of any shape; ``least`` is a least shape."""
-    shape = np.clip(level / np.maximum(noise, 1e-30), np.maximum(least, _LEAST_SHAPE), _LARGEST_SHAPE)
-    values = random.beta(shape / 2, shape / 2)
-    return np.where(shape < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
+def _shares(random: np.random.Generator, beta_shape: _Plane, least: FloatArray | float) -> FloatArray:
+    """Draw T from Beta for every one of the shapes, which are raised to ``least``."""
+    # Of NaN and a number, fmax returns the number.
+    bounded = np.minimum(np.fmax(beta_shape, np.maximum(least, _LEAST_SHAPE)), _LARGEST_SHAPE)
+    values = random.beta(bounded / 2, bounded / 2)
+    return np.where(bounded < _SHAPE_OF_ONE_SAMPLE, np.round(values), values).astype(np.float32)
 
 
 def _noise_around(image: FloatImage, around: FloatImage, threads: int) -> _Plane:
