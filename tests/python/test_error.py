@@ -74,10 +74,10 @@ def test_the_error_is_that_of_the_other_half_also_beside_bright_noise() -> None:
     noisy = _noisy(1, seed=7)
     noisy[0][::2] = 1e6 * rng.random((PIXELS // 2, 3), np.float32)
     denoised = _noisy(0.1, seed=8)
-    of_one, variance = crossed_errors(noisy, denoised)
+    error_of_one_half, variance = crossed_errors(noisy, denoised)
     a, b, denoised_a, denoised_b = (image.astype(np.float64) for image in (*noisy, *denoised))
     exact = ((denoised_a - b) ** 2 + (denoised_b - a) ** 2 - (a - b) ** 2) / 2
-    np.testing.assert_allclose(of_one, exact, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(error_of_one_half, exact, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(variance, (denoised_a - denoised_b) ** 2 / 4, rtol=1e-5, atol=1e-6)
 
 

@@ -41,8 +41,10 @@ def estimated_flicker(denoised: Halves, previous: Halves, noisy: Halves, previou
     d_denoised, d_noisy = _change(denoised, previous), _change(noisy, previous_noisy)
     with np.errstate(over="ignore", invalid="ignore"):
         denominator = _denominator(mean_of(denoised), mean_of(previous))
-        of_one, variance = (channel_mean(e / denominator) for e in crossed_errors(d_noisy, d_denoised))
-        mean, standard_error = mean_and_standard_error(of_one - variance)
+        error_of_one_half, variance = (
+            channel_mean(error / denominator) for error in crossed_errors(d_noisy, d_denoised)
+        )
+        mean, standard_error = mean_and_standard_error(error_of_one_half - variance)
     return mean if is_sure(mean, standard_error) else float(variance.mean(dtype=np.float64))
 
 

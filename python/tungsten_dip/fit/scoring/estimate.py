@@ -29,21 +29,23 @@ _OVERFLOW_BOUND = 1e30
 
 
 def estimate_error(candidates: Candidates, scale: float, denoised: Halves) -> FloatArray:
-    """Estimate the squared error of the mean f of both outputs in each pixel, relative to f^2 + 0.01.
+    """Estimate the squared error of f = (f_a + f_b) / 2 in each pixel, relative to f^2 + 0.01.
 
     ``candidates`` and ``scale`` are the evidence's, ``denoised`` the outputs f_a and f_b for one half each,
-    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's. The variance of f
-    is (f_a - f_b)^2 / 4 in the mean. Its bias cannot be measured. Pilots blur in different ways, so that they
-    differ from f where there is something to blur; but some are far off where the network rightly avoids
-    them, and there both outputs agree. The squared bias is estimated as `_BIAS` times the geometric mean of
-    the variance and the median squared difference of f and the pilots, or less if the noisy halves imply a
-    smaller mean error (see `error_from_halves`).
+    shape (pixels, 3), of the same pixels and in the same units; 0.01 is in the renderer's.
+
+    The error is the variance of f plus its squared bias. The variance is (f_a - f_b)^2 / 4 on average. The
+    bias of a pixel cannot be measured. Pilots blur in different ways, so that they differ from f where there
+    is something to blur; but some are far off where the network rightly avoids them, and there both outputs
+    agree. The squared bias is estimated as `_BIAS` times the geometric mean of the variance and the median
+    squared difference of f and the pilots, or less if the noisy halves imply a smaller error on average
+    (`error_from_halves`).
     """
     output = mean_of(denoised)
     epsilon = epsilon_of_renderer(scale)
     squared = variance_of_mean(denoised)
     variance = np.empty(len(output), np.float32)
-    bias = np.empty(len(output), np.float32)
+    bias_squared = np.empty(len(output), np.float32)
     computed = [(a.reshape(-1, 3), b.reshape(-1, 3)) for a, b in candidates.filtered]
     for first in range(0, len(output), _CHUNK_PIXELS):
         part = slice(first, first + _CHUNK_PIXELS)
@@ -56,15 +58,17 @@ def estimate_error(candidates: Candidates, scale: float, denoised: Halves) -> Fl
             variance[part] = np.minimum(channel_mean(squared[part] * relative)[:, 0], _OVERFLOW_BOUND)
             apart_squared = np.minimum(np.median(apart, axis=0), _OVERFLOW_BOUND)
         # The root of each: their product would overflow.
-        bias[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
+        bias_squared[part] = np.float32(_BIAS) * np.sqrt(variance[part]) * np.sqrt(apart_squared)
     estimated, standard_error = error_from_halves(candidates.noisy, denoised, epsilon)
-    least, mean_bias = (float(part.mean(dtype=np.float64)) for part in (variance, bias))
-    allowed = max(estimated + _CONFIDENCE * standard_error - least, 0.0)
-    return variance + bias * np.float32(min(1.0, allowed / max(mean_bias, 1e-30)))
+    mean_variance, mean_bias_squared = (
+        float(part.mean(dtype=np.float64)) for part in (variance, bias_squared)
+    )
+    allowed = max(estimated + _CONFIDENCE * standard_error - mean_variance, 0.0)
+    return variance + bias_squared * np.float32(min(1.0, allowed / max(mean_bias_squared, 1e-30)))
 
 
 def held_out_error(candidates: Candidates, denoised: Halves) -> float:
-    """Return the mean of the same error, estimated from the other half: unbiased, but noisy.
+    """Return the average of that error over all pixels, estimated from the other half: unbiased, but noisy.
 
     Relative to f^2 + 0.01 in the units of the evidence, so that what is decided by it does not depend on the
     exposure. Estimated from the noisy halves or, where their standard error is too large, from the first
@@ -80,27 +84,36 @@ def held_out_error(candidates: Candidates, denoised: Halves) -> float:
 
 
 def error_from_halves(targets: Halves, denoised: Halves, epsilon: np.float32) -> tuple[float, float]:
-    """Return the mean error of the mean of both outputs by independent targets, and its standard error."""
+    """Return the error of f = (f_a + f_b) / 2, relative to f^2 + ``epsilon``, and its standard error.
+
+    It is the average over all pixels, by ``targets``: independent images of the truth, one for each half.
+    """
     noisy_a, noisy_b = (image.reshape(-1, 3) for image in targets)
-    of_one, variance = crossed_errors((noisy_a, noisy_b), denoised)
-    denominator = mean_of(denoised) ** 2 + epsilon
-    return mean_and_standard_error(channel_mean(bounded_ratio(of_one - variance, denominator)))
+    error_of_one_half, variance = crossed_errors((noisy_a, noisy_b), denoised)
+    error = error_of_one_half - variance
+    return mean_and_standard_error(channel_mean(bounded_ratio(error, mean_of(denoised) ** 2 + epsilon)))
 
 
 def crossed_errors(noisy: Halves, denoised: Halves) -> tuple[FloatArray, FloatArray]:
-    """Return the squared error of one half's result in the mean, and the variance of the mean of both.
+    """Return estimates of the squared error of one half's result, and of the variance of f = (f_a + f_b) / 2.
 
     ``noisy`` are independent images a, b of the truth, and ``denoised`` the results f_a, f_b of one of them
-    each. The residuals f_a - a and f_b - b are independent, and the mean of each is the bias of a result, so
-    that the mean of their product is the squared bias. (f_a - f_b)^2 / 2 is in the mean the variance of one
-    result, and half of it that of (f_a + f_b) / 2. Where float32 overflows, either may be infinite, and the
-    first NaN.
+    each. The residuals f_a - a and f_b - b are independent, and the mean of each is the bias of a result.
+    With var, the variance of f, which is half that of f_a or f_b,
+
+        E[(f_a - a) (f_b - b)] = bias^2
+        E[(f_a - f_b)^2 / 4] = var
+        error of one half = bias^2 + 2 var
+        error of f = bias^2 + var
+
+    so that the error of f is the first estimate minus the second. Where float32 overflows, either may be
+    infinite, and the first NaN.
     """
     (a, b), (denoised_a, denoised_b) = noisy, denoised
     with np.errstate(over="ignore", invalid="ignore"):
         variance = variance_of_mean(denoised)
-        of_one = (denoised_a - a) * (denoised_b - b) + 2 * variance
-    return of_one, variance
+        error_of_one_half = (denoised_a - a) * (denoised_b - b) + 2 * variance
+    return error_of_one_half, variance
 
 
 def mean_and_standard_error(values: FloatArray) -> tuple[float, float]:
