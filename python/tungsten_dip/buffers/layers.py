@@ -198,30 +198,39 @@ def _view_layer(channel: str, layers: Layers) -> str:
 
 
 def _match(quantity: str, layers: Layers, color_prefix: str) -> str | None:
-    """Find the best layer.
+    """Find the best layer that is named for a quantity, None if there is none.
 
-    Of several view layers (what precedes the alias in the name), the colour is taken from the one that
-    contains most layers, and features only from the same one: those of others show other objects.
+    What precedes the alias in a layer's name is its view layer. The best layer is, in this order,
+
+    1. one of the colour's view layer; for the colour itself, one that Blender's compositor did not make,
+    2. one of three channels, if the quantity has three,
+    3. the one whose alias is the better one (`ALIASES`),
+    4. the one whose view layer contains most layers,
+    5. the first in the alphabet.
+
+    If the colour is in a view layer, none of another one is taken: it shows other objects. What the
+    compositor made counts as no view layer here.
     """
     matches = []
-    for layer in layers:
-        name = layer.lower()
-        count = len(_ordered(layers[layer]))
-        if name.startswith(_NO_LAYER) or count == 0:
+    for layer, components in layers.items():
+        name, count = layer.lower(), len(_ordered(components))
+        named = (a for a in ALIASES[quantity] if name == a or (a and name.endswith("." + a)))
+        alias = next(named, None)
+        if alias is None or name.startswith(_NO_LAYER) or count == 0:
             continue
-        for rank, alias in enumerate(ALIASES[quantity]):
-            if name == alias or (alias and name.endswith("." + alias)):
-                prefix = name[: len(name) - len(alias)]
-                strange = prefix == _COMPOSITE if quantity == "color" else prefix != color_prefix
-                if strange and prefix and color_prefix not in ("", _COMPOSITE):
-                    break
-                held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
-                # One channel called color may be an id, beside the three that are the colour.
-                # Beside a noisy grey picture, R, G, B are what was made of it.
-                noisy_grey = alias == "noisy" and "Y" in layers[layer]
-                too_few = quantity in _THREE_CHANNELS and count < 3 and not noisy_grey
-                matches.append((strange, too_few, rank, -held, layer))
-                break
+        prefix = name.removesuffix(alias)
+        if quantity == "color":
+            elsewhere = prefix == _COMPOSITE
+        else:
+            elsewhere = prefix != color_prefix
+            if elsewhere and prefix and color_prefix not in ("", _COMPOSITE):
+                continue
+        # One channel called color may be an id, beside the three that are the colour.
+        # Beside a noisy grey picture, R, G, B are what was made of it.
+        noisy_grey = alias == "noisy" and "Y" in components
+        too_few = quantity in _THREE_CHANNELS and count < 3 and not noisy_grey
+        held = sum(other.lower().startswith(prefix) for other in layers) if prefix else 0
+        matches.append((elsewhere, too_few, ALIASES[quantity].index(alias), -held, layer))
     return min(matches)[-1] if matches else None
 
 
