@@ -1,5 +1,9 @@
 """The two networks of the published method: Skip (Ulyanov et al., "Deep Image Prior", CVPR 2018) and ResNet.
 
+No other preset uses them. They are the baseline that the other presets are compared with, also by time, and
+so must not be slower than need be. Hence layers of our own where those of PyTorch are slow ("Seconds per
+iteration" in docs/method.md has what they bring).
+
 Both take (batch, channels, height, width) of any size from 1x1 and return the same size. A batch norm always
 uses the statistics of the batch in hand, in ``eval()`` too: on one image it is an instance norm.
 
