@@ -527,6 +527,29 @@ def test_buffers_of_a_host_become_layers(tmp_path: Path, size: tuple[int, int], 
     assert_same(buffers, read_buffers(tmp_path / "folder"))
 
 
+@pytest.mark.parametrize("key", ["color", "albedo", "colorVariance"])
+def test_a_denoised_image_is_not_read_as_a_file_of_a_folder_or_a_scene(tmp_path: Path, key: str) -> None:
+    for name in ("color", "albedo", "colorVariance"):
+        write_image(tmp_path / f"{name}.pfm", noise((2, 3, 3)))
+    requests = [
+        {"type": "color", "hdr_output_file": "color.exr", "sample_variance": True},
+        {"type": "albedo", "hdr_output_file": "albedo.exr"},
+    ]
+    scene = tmp_path / "scene.json"
+    scene.write_text(json.dumps({"renderer": {"output_buffers": requests}}))
+    buffers = read_buffers(tmp_path)
+    for name in ("color", "albedo", "colorVariance"):
+        write_image(tmp_path / f"{name}.exr", noise((2, 3, 3)))
+    read_buffers(scene)
+    denoised = tmp_path / f"{key}.exr"
+    write_denoised(denoised, result_for(buffers), buffers)
+    for path, mapping in ((tmp_path, {}), (tmp_path, {key: denoised.name}), (scene, {})):
+        with pytest.raises(InputError, match=f"{key}.exr: expected what was rendered, found a denoised"):
+            read_buffers(path, mapping)
+    assert_same(buffers, read_buffers(denoised))
+    assert_same(buffers, read_buffers(tmp_path, {key: f"{key}.pfm"}))
+
+
 def test_a_folder_of_another_render_is_not_mixed_in(tmp_path: Path) -> None:
     buffers = synthetic_render(height=3, width=4).buffers
     write_tungsten_folder(tmp_path, buffers)

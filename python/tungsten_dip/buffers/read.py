@@ -149,6 +149,11 @@ def _from_images(
     channels: dict[str, Channel] = {}
     ignored = list(ignored)
     for key, (first, *others) in images.items():
+        if ADDED in first.attributes:
+            raise InputError(
+                f"{files[key]}: expected what was rendered, found a denoised image; move it away, or name it "
+                "alone as the input, for the noisy image that it holds"
+            )
         if first.window != color.window:
             raise InputError(_sizes_differ(str(files[key]), first, color))
         fitting = [first]
