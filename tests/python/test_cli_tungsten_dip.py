@@ -364,3 +364,22 @@ def test_buffers_are_not_written_over(folder, tmp_path, fits, capfd, plane):
     single = tmp_path / "single.exr"
     assert command.main(["denoise", str(folder), "-o", str(single)]) == 0
     assert command.main(["denoise", str(single), "-o", str(single)]) == 0  # all layers are in the result
+
+
+@pytest.mark.parametrize("name", ["color.exr", "albedoB.EXR", "depth.exr", "beauty.exr"])
+def test_no_output_takes_the_name_of_a_buffer(tmp_path, render, fits, capfd, monkeypatch, name):
+    for stem in ("color", "beauty"):
+        write_image(tmp_path / f"{stem}.pfm", render.buffers.color.mean)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    for options in (["-o", name], ["-o", "../o.exr", "--error-map", f"./{name}"]):
+        status = command.main(["denoise", ".", "--map", "color=beauty", "--map", "depth=none", *options])
+        fails(capfd, status, name, "one of the files that are read")
+    assert sorted(tmp_path.iterdir()) == before
+    assert command.main(["denoise", "color.pfm", "-o", name]) == 0  # one file is no folder
+
+
+def test_a_folder_may_hold_its_result_under_another_name(folder, fits):
+    options = ["-o", str(folder / "denoised.exr"), "--error-map", str(folder / "none.exr")]
+    for _ in range(2):
+        assert command.main(["denoise", str(folder), "--map", "normal=none", *options]) == 0

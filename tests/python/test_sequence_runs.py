@@ -187,6 +187,16 @@ def test_a_result_never_takes_the_place_of_an_input(frames, capsys):
     assert {path: path.read_bytes() for path in before} == before
 
 
+def test_a_result_never_takes_the_name_of_an_input_of_another_format(frames, capsys):
+    for color in list(Path("noisy").glob("f*/color.exr")):
+        write_image(color.with_suffix(".pfm"), read_image(color))
+        color.unlink()
+    for output in ("noisy/f####/color.exr", "noisy/f%04d/depth.EXR"):
+        assert main([*arguments()[:2], "-o", output, "--preset", "draft"]) == 2
+        assert "is one of the files that are read" in capsys.readouterr().err
+    assert not list(Path("noisy").glob("f*/color.exr"))
+
+
 def test_flicker_is_that_against_the_frame_before(frames, capfd):
     (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
     assert main(arguments("--json")) == 2

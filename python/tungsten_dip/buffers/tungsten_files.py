@@ -52,6 +52,12 @@ def files_of_folder(folder: Path, mapping: Mapping[str, str]) -> tuple[dict[str,
     return files, [file.name for file in present if file not in files.values()]
 
 
+def is_named_for_a_plane(file: Path, mapping: Mapping[str, str]) -> bool:
+    """Return whether `files_of_folder` takes such a file if it is there, with or without the map."""
+    names = {*MAP_KEYS[:-1], *mapping.values()} - {NOTHING}
+    return file.suffix.lower() in RADIANCE_SUFFIXES and not names.isdisjoint((file.name, file.stem))
+
+
 def files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
     """Return the files that Tungsten writes for a scene, named as its ``OutputBuffer::save`` names them.
 

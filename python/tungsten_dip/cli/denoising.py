@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from tungsten_dip.buffers.render_buffers import RenderBuffers
+from tungsten_dip.buffers.tungsten_files import is_named_for_a_plane
 from tungsten_dip.cli.console import duration, progress_on_stderr
 from tungsten_dip.errors import InputError
 from tungsten_dip.fit import denoise
@@ -124,10 +125,20 @@ def load_warm_start(path: Path | None) -> Model | None:
     return load_model(path)
 
 
-def check_outputs_are_not_inputs(outputs: Iterable[Path | None], inputs: Collection[Path]) -> None:
-    """Raise InputError if one of the outputs, where they are named, is among the resolved inputs."""
-    for path in outputs:
-        if path is not None and path.resolve() in inputs:
+def check_outputs_are_not_inputs(
+    outputs: Iterable[Path | None],
+    inputs: Collection[Path],
+    folders: Collection[Path],
+    mapping: Mapping[str, str],
+) -> None:
+    """Raise InputError if one of the outputs, where they are named, is among the resolved inputs.
+
+    Nor may one have a name that is read in one of the ``folders`` (resolved, with their ``--map``), whether
+    there is such a file or not: the next run would take it for what was rendered.
+    """
+    for path in filter(None, outputs):
+        file = path.resolve()
+        if file in inputs or (file.parent in folders and is_named_for_a_plane(file, mapping)):
             raise InputError(f"{path}: is one of the files that are read; name another file")
 
 

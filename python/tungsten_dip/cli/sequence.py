@@ -116,7 +116,12 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
     numbers = None if options.frames is None else numbers_from_text(options.frames)
     frames = find_frames(options.input, options.output, numbers, options.cameras)
     mapping = layer_mapping(options)
-    check_outputs_are_not_inputs((frame.output for frame in frames), set(_input_files(frames, mapping)))
+    check_outputs_are_not_inputs(
+        (frame.output for frame in frames),
+        set(_input_files(frames, mapping)),
+        {frame.input.resolve() for frame in frames},
+        mapping,
+    )
     results = [(frames[0].output, ".exr"), (options.report, ".html"), (options.save_model, ".onnx")]
     for file, suffix in results:
         if file is not None:

@@ -230,7 +230,8 @@ def _checked_outputs(scene: Scene, options: Options, taken: set[Path]) -> SceneO
     for file in own:
         check_writable(file, file.suffix)
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
-    check_outputs_are_not_inputs(sorted(rendered | derived), {file.resolve() for file in scene.files})
+    inputs = {file.resolve() for file in scene.files}
+    check_outputs_are_not_inputs(sorted(rendered | derived), inputs, folders=(), mapping={})
     both = rendered & derived
     if both:
         raise InputError(f"{min(both)}: named for the render and for what is made of it; name two files")

@@ -193,11 +193,11 @@ def _denoised(
 
     mapping = layer_mapping(options)
     inputs = [file.resolve() for file in input_files(options.input, mapping)]
+    resolved = options.input.resolve()
     # One file that holds everything may be replaced: the result passes all of its layers through.
-    is_whole = inputs == [options.input.resolve()]
-    check_outputs_are_not_inputs(
-        [options.error_map] if is_whole else [options.output, options.error_map], inputs
-    )
+    is_whole = inputs == [resolved]
+    outputs = [options.error_map] if is_whole else [options.output, options.error_map]
+    check_outputs_are_not_inputs(outputs, inputs, [resolved], mapping)
 
     with remarks_from_log() as remarks:
         buffers = read_buffers(options.input, mapping)
