@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tungsten_dip import _core
+from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import (
     FEATURES,
     FloatImage,
@@ -41,15 +42,17 @@ _DRAFT_SHARE = 0.7
 class Evidence:
     """What is computed from one image, its linear radiance multiplied by ``scale`` (a power of two).
 
-    ``mean`` is the noisy image, without fireflies. ``guide_variance`` is that of the pilots' guides (see
-    `Guides`). ``gain`` is what gives back the radiance of fireflies (`fireflies.Limited`). ``halves_drawn``
-    and ``notes`` are those of the result (`FitResult`).
+    ``mean`` is the noisy image, without fireflies. ``light`` is what the samples of each half saw directly of
+    lights, shape (height, width, 1); None if that is not known of each. ``guide_variance`` is that of the
+    pilots' guides (see `Guides`). ``gain`` is what gives back the radiance of fireflies
+    (`fireflies.Limited`). ``halves_drawn`` and ``notes`` are those of the result (`FitResult`).
     """
 
     scale: float
     mean: FloatImage
     layout: Layout
     candidates: Candidates
+    light: Halves | None
     guide_variance: FloatImage
     gain: FloatImage | None
     halves_drawn: bool
@@ -136,6 +139,7 @@ def evidence_from_buffers(
         mean=mean,
         layout=layout,
         candidates=candidates,
+        light=_light(image, halves, scale),
         guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
@@ -184,6 +188,14 @@ def _without_fireflies(image: HalvedImage, scale: float, threads: int) -> tuple[
     if limited.gain is None:
         return scaled(color.mean, scale), limited
     return mean_of(limited.halves), limited
+
+
+def _light(image: HalvedImage, halves: Halves, scale: float) -> Halves | None:
+    albedo = image.buffers.albedo
+    if albedo is None or albedo.halves is None or image.drawn:
+        return None
+    emission = emission_of_halves(image.buffers, halves, scale)
+    return None if emission is None else (channel_mean(emission[0]), channel_mean(emission[1]))
 
 
 def with_best_baseline(evidence: Evidence, cues: Cues) -> tuple[Evidence, Cues]:

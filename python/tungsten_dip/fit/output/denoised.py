@@ -21,6 +21,7 @@ from tungsten_dip.fit.evidence import Evidence
 from tungsten_dip.fit.output.all_samples import with_all_samples
 from tungsten_dip.fit.output.lost_detail import with_lost_detail
 from tungsten_dip.fit.output.lost_light import gain_of_lost_light
+from tungsten_dip.fit.output.unseen_light import without_unseen_light
 from tungsten_dip.fit.preparation.exposure import exposure, unscaled
 from tungsten_dip.fit.result import DenoisedImage
 from tungsten_dip.fit.scoring.estimate import (
@@ -103,6 +104,8 @@ def denoised_image(
         # What the halves' blends lost, that of all samples lost with the same weights.
         with_detail = np.maximum(all_samples_blend + (image - blended), 0)
         image = with_all_samples(denoised, with_detail, threads)
+    if evidence.light is not None:
+        denoised, image = without_unseen_light(noisy, denoised, image, evidence.light)
     if not evidence.halves_drawn:
         light = gain_of_lost_light(noisy, mean_of(denoised), threads)
         light_of_all = light if all_samples_blend is None else gain_of_lost_light(noisy, image, threads)

@@ -1,0 +1,91 @@
+"""Takes light away that was smeared into pixels none of whose samples saw it.
+
+Beside lamps and the sky, filters estimate from the pixels along an edge which part of a pixel the light
+fills. Where the edge ends or bends, as at the tip of a dark post before the sky, that part is too large. The
+samples of the pixel itself tell: all n of them miss a light that fills the part p of it with probability
+(1 - p)^n.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from tungsten_dip.buffers.channels import channel_mean
+from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
+from tungsten_dip.fit.neighbours import largest_around
+from tungsten_dip.fit.preparation.exposure import BLACK
+
+_BRIGHTER = 2.0
+"""Results brighter than so many times the noisy pixel may contain light that is not there."""
+
+_LARGEST_PART = 0.98
+_STANDARD_ERRORS = 2.0
+"""So many standard errors are subtracted from the number of pixels without light."""
+
+_MOST_SAMPLES = 1e4
+
+_Floats = npt.NDArray[np.float64]
+
+
+def without_unseen_light(
+    noisy: Halves, denoised: Halves, image: FloatImage, light: Halves
+) -> tuple[Halves, FloatImage]:
+    """Return both halves' results and the image, nearer to the noisy ones where they have unseen light.
+
+    All but ``light`` are linear radiance of shape (height, width, 3); ``light`` is what the samples of each
+    half saw directly of lights, shape (height, width, 1). Of the pixels beside a light that one half did not
+    see, the other half misses it more often than the results allow: this excess is the probability that there
+    is none. By Bayes' rule follows that of a pixel that both halves missed.
+    """
+    seen, mean = mean_of(light), mean_of(noisy)
+    brightest = largest_around(np.where(seen > 0, channel_mean(mean), np.float32(0)), 1)
+    rim = (brightest > 0) & (-largest_around(-seen, 1) == 0)
+    if not rim.any():
+        return denoised, image
+    samples = _samples(light, seen, rim) / 2
+
+    def missed(
+        result: FloatImage, pixel: FloatImage, unseen: npt.NDArray[np.bool_]
+    ) -> tuple[npt.NDArray[np.bool_], _Floats]:
+        """Return which of the unseen pixels have light in the result, and the probability to miss it."""
+        level, dark = channel_mean(result), channel_mean(pixel)
+        chosen = rim & unseen & (level > _BRIGHTER * (dark + np.float32(BLACK)))
+        part = (level - dark)[chosen] / np.maximum(brightest - dark, np.float32(1e-15))[chosen]
+        probability: _Floats = (1 - np.clip(part.astype(np.float64), 0, _LARGEST_PART)) ** samples
+        return chosen, probability
+
+    excess, expected, count = 0.0, 0.0, 0
+    for half, (own, other) in enumerate((light, light[::-1])):
+        chosen, probability = missed(denoised[half], noisy[half], own == 0)
+        missing = np.count_nonzero(other[chosen] == 0)
+        error = np.sqrt((probability * (1 - probability)).sum())
+        excess += missing - probability.sum() - _STANDARD_ERRORS * error
+        expected += probability.sum()
+        count += len(probability)
+    if excess <= 0:
+        return denoised, image
+    prior = excess / (count - expected)
+    chosen, probability = missed(image, mean, seen == 0)
+    share: FloatImage = np.zeros_like(seen)
+    share[chosen] = prior / (prior + (1 - prior) * probability)
+
+    def darkened(result: FloatImage, pixel: FloatImage) -> FloatImage:
+        darker: FloatImage = result + share * np.minimum(pixel - result, np.float32(0))
+        return darker
+
+    a, b = (darkened(result, half) for result, half in zip(denoised, noisy, strict=True))
+    return (a, b), darkened(image, mean)
+
+
+def _samples(light: Halves, seen: FloatImage, rim: npt.NDArray[np.bool_]) -> float:
+    """Estimate how many samples a pixel has from how the halves differ where a light fills a part of it.
+
+    The parts p_a and p_b that n / 2 samples each hit, and their mean p, fulfil
+    E[(p_a - p_b)^2] / E[p (1 - p)] = 4 / (n - 1). Other noise makes n smaller.
+    """
+    largest = largest_around(seen, 1)[rim].astype(np.float64)
+    a, b = (np.minimum(half[rim] / largest, 2) for half in light)
+    part = np.clip((a + b) / 2, 0, 1)
+    varied = float(((a - b) ** 2).sum())
+    return min(1 + 4 * float((part * (1 - part)).sum()) / max(varied, 1e-9), _MOST_SAMPLES)
