@@ -1,7 +1,7 @@
 """Fireflies: single samples so bright that no filter can spread them without leaving a blot.
 
-Their radiance is limited. As far as what this removes is statistically certain, it is given back, spread over
-noisy surroundings.
+Their radiance is limited. What this removes where nothing around is bright is given back, less a standard
+error, spread over noisy surroundings.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ _BRIGHTEST = 1e30
 _MOST_RETURNED = 60.0
 """No firefly gives back more than so many times the radiance around it: few hold most of what is removed."""
 
-_STANDARD_ERRORS = 3.0
-"""So many standard errors are subtracted from what is given back."""
+_BRIGHT_SPOT = 2.0
+"""Where the other half is so many times brighter near a firefly than farther around, its light belongs to a
+lamp or a highlight, and would be wrong anywhere else. One firefly of the other half, limited to 15 times its
+surroundings, does not make 5x5 pixels so bright."""
 
 _LARGEST_GAIN = 1.5
 """Where little else is noisy, a few pixels would get back what fireflies lost all over the image."""
@@ -64,8 +66,8 @@ _LEAST = 1e-15
 class Limited:
     """Both halves with their fireflies limited, linear radiance of shape (height, width, 3).
 
-    ``gain``, shape (height, width, 1), from 1 to 1.5, times the denoised image gives back what is certain of
-    the radiance removed. ``note`` is a line on that radiance. Both are None without fireflies.
+    ``gain``, shape (height, width, 1), from 1 to 1.5, times the denoised image gives back some of the
+    radiance removed. ``note`` is a line on that radiance. Both are None without fireflies.
     """
 
     halves: Halves
@@ -126,8 +128,11 @@ def limit_fireflies(
         f"{count} {noun} limited, with {100 * share:.3g}% of the image's energy, which the estimated error "
         "leaves out"
     )
-    returned = [np.minimum(t, _MOST_RETURNED * around).astype(np.float32) for t in taken]
-    return Limited((a, b), _gain(returned, (a, b), threads), note)
+    returned = [
+        np.where(_is_spot(channel_mean(other), threads), 0, np.minimum(t, _MOST_RETURNED * around))
+        for t, other in zip(taken, (b, a), strict=True)
+    ]
+    return Limited((a, b), _gain([r.astype(np.float32) for r in returned], (a, b), threads), note)
 
 
 _Levels = npt.NDArray[np.float64]
@@ -174,23 +179,37 @@ def _limited(image: FloatImage, level: _Levels, limit: _Levels) -> FloatImage:
     return limited
 
 
-def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
-    """Return 1 plus the certain part of what was ``taken`` from the halves, relative to their level.
+def _is_spot(level: FloatImage, threads: int) -> npt.NDArray[np.bool_]:
+    """Return where the pixels around are far brighter than those farther around, shape (height, width, 1)."""
+    near, far = (_core.box_mean(level, radius, threads) for radius in (_SPOT_RADIUS, _RADIUS))
+    spot: npt.NDArray[np.bool_] = near > np.float32(_BRIGHT_SPOT) * far
+    return spot
 
-    It is the mean over a window of half the image's longer side, less three standard errors, and goes where
-    the halves differ: pixels without noise keep their radiance. Fireflies strike independently of one
-    another, so that the variance of their sum is the sum of their squares.
+
+def _gain(taken: list[FloatImage], halves: Halves, threads: int) -> FloatImage:
+    """Return 1 plus what was ``taken`` from the halves, less its standard error, relative to their level.
+
+    It is the mean over a window of half the image's longer side, and goes where the halves differ: pixels
+    without noise keep their radiance, and those noisier than the mean, as in a highlight, get no more than
+    others. Fireflies strike independently of one another, so that the variance of their sum is the sum of
+    their squares; those within a spot count as one, which a pixel filter may have spread.
     """
     radius = max(taken[0].shape[:2]) // 4
-    pixels = window_pixels(taken[0].shape, radius)
-    mean = _core.box_mean(mean_of((taken[0], taken[1])), radius, threads)
-    squares = _core.box_mean(np.float32(0.25) * (taken[0] ** 2 + taken[1] ** 2), radius, threads)
-    certain = np.maximum(mean - np.float32(_STANDARD_ERRORS) * np.sqrt(squares / pixels), 0)
+
+    def mean(values: FloatImage) -> FloatImage:
+        return _core.box_mean(values, radius, threads)
+
+    spot = window_pixels(taken[0].shape, _SPOT_RADIUS)
+    squares = [t * spot * _core.box_mean(t, _SPOT_RADIUS, threads) for t in taken]
+    variance = np.float32(0.5) * mean_of((squares[0], squares[1]))
+    error = np.sqrt(mean(variance) / window_pixels(spot.shape, radius))
+    given = np.maximum(mean(mean_of((taken[0], taken[1]))) - error, 0)
     a, b = (channel_mean(half) for half in halves)
     level = _core.box_mean(mean_of((a, b)), _RADIUS, threads)
     noise = _core.box_mean(np.abs(a - b), _RADIUS, threads)
-    share = noise / np.maximum(_core.box_mean(noise, radius, threads), np.float32(_LEAST))
-    gain = 1 + certain * share / np.maximum(level, np.float32(_LEAST))
+    noise = np.minimum(noise, mean(noise))
+    share = noise / np.maximum(mean(noise), np.float32(_LEAST))
+    gain = 1 + given * share / np.maximum(level, np.float32(_LEAST))
     bounded: FloatImage = np.minimum(gain, _LARGEST_GAIN).astype(np.float32)
     return bounded
 
