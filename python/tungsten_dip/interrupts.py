@@ -19,8 +19,7 @@ _TURN_S = 0.1
 def deferred_interrupts() -> Iterator[None]:
     """Defer Ctrl-C within the block to its end.
 
-    For imports of libraries, which would leave a module half initialised or end the process, and for short
-    work without which longer work would be lost.
+    For imports of libraries, which would leave a module half initialised or end the process.
     """
     pressed = False
 

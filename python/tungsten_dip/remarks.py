@@ -6,26 +6,24 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
-
-_REMARKS: ContextVar[tuple[list[str], ...]] = ContextVar("remarks", default=())
-"""The lists of the blocks that the thread in hand is in."""
-
-
-class _Collector(logging.Handler):
-    """Adds a line to the lists of the thread that logs it."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        for remarks in _REMARKS.get():
-            remarks.append(record.getMessage())
-
-
-_COLLECTOR = _Collector(logging.INFO)
 
 _LOCK = threading.Lock()
 _open: list[logging.Handler] = []
-_levels_before: list[int] = []
-"""One for each block of `logging_to`, which may overlap in several threads."""
+_level_before = logging.NOTSET
+"""Blocks of `logging_to` may overlap in several threads; the level is that of the time without any."""
+
+
+class _Collector(logging.Handler):
+    """Adds the lines that one thread logs to a list."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.remarks: list[str] = []
+        self._thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self.remarks.append(record.getMessage())
 
 
 @contextmanager
@@ -35,13 +33,9 @@ def remarks_from_log() -> Iterator[list[str]]:
     Other threads may do other work of this process. Those that a fit or a render starts for itself compute
     only, or repeat what was logged before.
     """
-    remarks: list[str] = []
-    token = _REMARKS.set((*_REMARKS.get(), remarks))
-    try:
-        with logging_to(_COLLECTOR):
-            yield remarks
-    finally:
-        _REMARKS.reset(token)
+    collector = _Collector()
+    with logging_to(collector):
+        yield collector.remarks
 
 
 @contextmanager
@@ -50,19 +44,19 @@ def logging_to(handler: logging.Handler) -> Iterator[None]:
 
     The level of the library's logger stays low until the last of all blocks ends.
     """
+    global _level_before
     logger = logging.getLogger("tungsten_dip")
     with _LOCK:
+        if not _open:
+            _level_before = logger.level
         _open.append(handler)
-        _levels_before.append(logger.level)
         logger.setLevel(min(handler.level, logger.getEffectiveLevel()))
         logger.addHandler(handler)
     try:
         yield
     finally:
         with _LOCK:
+            logger.removeHandler(handler)
             _open.remove(handler)
-            if handler not in _open:
-                logger.removeHandler(handler)
-            level = _levels_before.pop()
             if not _open:
-                logger.setLevel(level)
+                logger.setLevel(_level_before)

@@ -158,7 +158,7 @@ def test_available_memory_is_no_more_than_a_container_has(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "memory.max").write_text(f"{limit}\n")
         (folder / "memory.current").write_text(f"{3 << 20}\n")
-        (folder / "memory.stat").write_text(f"anon 5\ninactive_file {1 << 20}\nactive_file 7\n")
+        (folder / "memory.stat").write_text(f"anon 5\ninactive_file {1 << 19}\nactive_file {1 << 19}\n")
     assert memory._available_bytes(tmp_path) == expected
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from concurrent.futures import wait
 from contextlib import suppress
 from dataclasses import replace
@@ -40,14 +39,6 @@ def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRe
     assert result.interrupted
     assert any(note.startswith(f"interrupted at step {result.iterations}") for note in result.notes)
     assert 1 <= result.iterations < 1000
-
-
-@pytest.fixture
-def _sigint_interrupts() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT, also where a background job was started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(

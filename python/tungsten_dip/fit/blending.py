@@ -35,8 +35,10 @@ from tungsten_dip.fit.presets import Recipe, pilots_for_size, recipe_of, steps_f
 from tungsten_dip.fit.result import DenoisedImage, FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.stages import stage
-from tungsten_dip.interrupts import deferred_interrupts, wait_in_short_turns
+from tungsten_dip.interrupts import interrupts_as_requests, wait_in_short_turns
 from tungsten_dip.progress import Progress, part_of
+
+_FINISHING = "interrupted: making the image of what was reached; press Ctrl-C again to give it up"
 
 
 def fit_blend(
@@ -56,8 +58,8 @@ def fit_blend(
     the shape of the colour, NaN where they have no value. They are an extra pilot, with which fewer others
     are needed.
 
-    Ctrl-C during the training or after it ends the fit early. The pilots of all samples are then used if they
-    are complete, else given up: the image is made of the halves alone.
+    Ctrl-C during a training ends the fit early. The pilots of all samples are then used if they are complete,
+    else given up: the image is made of the halves alone. Ctrl-C while an image is made ends the fit after it.
     """
     clock, threads = Clock(settings.time_budget_s), thread_count(settings.threads)
     unchanged = image_without_noise(buffers, threads)
@@ -67,32 +69,32 @@ def fit_blend(
     halved = with_independent_halves(buffers, settings.seed, threads)
     recipe = recipe_of(settings, following=previous is not None)
     if warm_start is not None or not are_pixels_independent(halved.halves):
-        recipe = replace(recipe, groupings=1)
+        recipe = replace(recipe, regroups=False)
     fitter = _Fitter(settings, recipe, clock, threads, warm_start, previous, refit_steps)
-    first = fitter.fit(halved, part_of(progress, 0, 1 / recipe.groupings))
-    fits, training = [first], first.training
-    for index in range(1, recipe.groupings):
-        if training.interrupted or training.stopped:
-            break
-        part = part_of(progress, index / recipe.groupings, (index + 1) / recipe.groupings)
+    fits = [fitter.fit(halved, part_of(progress, 0, 0.5) if recipe.regroups else progress)]
+    first, training = fits[0], fits[0].training
+    if recipe.regroups and not training.interrupted and not training.stopped:
         try:
-            further = fitter.fit(regrouped(halved, settings.seed, index), part, index, first)
-            if further.training.interrupted:
-                raise KeyboardInterrupt
+            again = fitter.fit(regrouped(halved, settings.seed), part_of(progress, 0.5, 1), first)
         except KeyboardInterrupt:
             training.interrupted = True
-            training.notes.append(f"interrupted: made of {index} of {recipe.groupings} groupings of samples")
-            break
-        fits.append(further)
-    image = mean_of_images([fit.image for fit in fits])
-    model = Model(
-        inputs=first.blend.layout.inputs,
-        weights=joined_members([fit.weights for fit in fits]),
-        settings=first.settings,
-        estimated_relmse=image.estimated_relmse,
-        source_sha256=source_sha256(buffers),
-        blend=first.blend,
-    )
+        else:
+            training.interrupted = again.training.interrupted
+            if again.training.steps_done == training.steps_done:
+                fits.append(again)
+    if recipe.regroups and training.interrupted and len(fits) == 1:
+        training.notes.append("interrupted: the samples were grouped into halves once instead of twice")
+    with interrupts_as_requests(_FINISHING) as requested:
+        image = mean_of_images([fit.image for fit in fits])
+        model = Model(
+            inputs=first.blend.layout.inputs,
+            weights=joined_members([fit.weights for fit in fits]),
+            settings=first.settings,
+            estimated_relmse=image.estimated_relmse,
+            source_sha256=source_sha256(buffers),
+            blend=first.blend,
+        )
+    training.interrupted |= requested()
     if not training.interrupted:
         progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
     return replace(
@@ -106,7 +108,7 @@ def fit_blend(
 
 @dataclass(frozen=True)
 class _Fit:
-    """What a fit to one grouping of the samples into halves gives; ``weights`` are those of its members."""
+    """What a fit to one pair of halves gives; ``weights`` are those of its members."""
 
     image: DenoisedImage
     weights: Weights
@@ -118,7 +120,7 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Fitter:
-    """Fits a network to a grouping of an image's samples into halves; the fields are those of `fit_blend`."""
+    """Fits a network to a pair of halves of an image; the fields are those of `fit_blend`."""
 
     settings: FitSettings
     recipe: Recipe
@@ -128,20 +130,29 @@ class _Fitter:
     previous: Halves | None
     refit_steps: int | None
 
-    def fit(self, image: HalvedImage, progress: Progress, index: int = 0, first: _Fit | None = None) -> _Fit:
-        """Fit the members of one grouping; layout and pilots of all samples are the ``first`` one's."""
+    def fit(self, image: HalvedImage, progress: Progress, first: _Fit | None = None) -> _Fit:
+        """Fit a network to the halves of an image.
+
+        If the ``first`` fit was to other halves, its layout, standardisation and pilots of all samples are
+        used again: the networks of both are one.
+        """
         settings, recipe, threads = self.settings, self.recipe, self.threads
         width, height = image.buffers.width, image.buffers.height
-        blend = first.blend if first else self.warm_start.blend if self.warm_start else None
+        if first is not None:
+            blend: Blend | None = first.blend
+        else:
+            blend = None if self.warm_start is None else self.warm_start.blend
         plan = pilots_for_size(recipe.pilots, width, height) if blend is None else blend.layout
         with_oidn = settings.pilot == "oidn"
         evidence, cues = evidence_from_buffers(
             image, plan, self.clock, progress, threads=threads, with_oidn=with_oidn, previous=self.previous
         )
-        members = recipe.members // recipe.groupings
-        start = start_of_training(
-            evidence, cues, settings.seed + index, members, self.warm_start, first.blend if first else None
-        )
+        if first is None:
+            seed, beside = settings.seed, None
+        else:
+            seed, beside = settings.seed + 1, first.blend
+        members = recipe.members // 2 if recipe.regroups else recipe.members
+        start = start_of_training(evidence, cues, seed, members, self.warm_start, beside)
         evidence = start.evidence
         del cues  # Large images need gigabytes for them.
         if start.warm and self.refit_steps is not None:
@@ -157,25 +168,24 @@ class _Fitter:
                 evidence, image.buffers, self.clock, with_oidn=with_oidn, given_up=given_up
             )
 
-        with _AllSamplesPilots(pilots_beside) as beside:
+        with _AllSamplesPilots(pilots_beside) as beside_training:
             # Each network keeps one core busy; these pilots take what is left of all of them.
             if threads == 1:
-                beside.result()
+                beside_training.result()
             steps = settings.iterations or steps_for_size(recipe.steps, width, height)
             training = train(
                 network, start, settings, steps, recipe.batch_pixels, self.clock, stage(progress, "training")
             )
-            all_samples_pilots = beside.result_after(training)
+            all_samples_pilots = beside_training.result_after(training)
         if training.interrupted and recipe.all_samples and not all_samples_pilots:
             training.notes.append("without the pilots of all samples: the image is made of the halves alone")
-        inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
-        try:
-            with deferred_interrupts():
-                blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
-                denoised = denoised_image(evidence, *blended)
-        except KeyboardInterrupt:
-            training.interrupted = True
-        return _Fit(denoised, network.weights(), start.blend, settings, training, all_samples_pilots)
+        with interrupts_as_requests(_FINISHING) as requested:
+            inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
+            blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
+            denoised = denoised_image(evidence, *blended)
+            weights = network.weights()
+        training.interrupted |= requested()
+        return _Fit(denoised, weights, start.blend, settings, training, all_samples_pilots)
 
 
 class _AllSamplesPilots:

@@ -174,7 +174,7 @@ def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
 
 @dataclass
 class Training:
-    """How far a training went; ``stopped`` if before its last step, for a reason other than Ctrl-C."""
+    """How far a training went; ``stopped`` if a target or a budget ended it."""
 
     steps_done: int = 0
     interrupted: bool = False

@@ -65,10 +65,7 @@ def image_without_noise(buffers: RenderBuffers, threads: int) -> DenoisedImage |
 
 
 def mean_of_images(images: Sequence[DenoisedImage]) -> DenoisedImage:
-    """Return the mean of images of one render, with the halves and notes of the first.
-
-    The error is the mean of theirs, which that of the mean does not exceed.
-    """
+    """Return the mean of images of one render and of their errors, and halves and notes of the first."""
     first = images[0]
     if len(images) == 1:
         return first
@@ -106,6 +103,8 @@ def denoised_image(
         image = with_all_samples(denoised, with_detail, threads)
     if evidence.light is not None:
         denoised, image = without_unseen_light(noisy, denoised, image, evidence.light)
+    if all_samples_blend is None:
+        image = mean_of(denoised)
     if not evidence.halves_drawn:
         light = gain_of_lost_light(noisy, mean_of(denoised), threads)
         light_of_all = light if all_samples_blend is None else gain_of_lost_light(noisy, image, threads)

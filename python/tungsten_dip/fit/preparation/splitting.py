@@ -62,8 +62,7 @@ that is about Beta's for the shape n p / (1 - p) (hypergeometric). Images of few
 
 _ALIKE = 0.05
 _STANDARD_ERRORS = 4.0
-"""So many more neighbours than half may have noise of one sign (twice that share), and so many standard
-errors."""
+"""The signs of neighbours' noise may have this correlation, and so many standard errors more."""
 
 _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
@@ -107,27 +106,31 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int) -> 
 
 
 def are_pixels_independent(halves: Halves) -> bool:
-    """Whether the noise of neighbouring pixels is independent, as far as signs tell.
+    """Whether the noise of neighbouring pixels is independent, as far as its signs tell.
 
-    The halves' difference has either sign with the same probability. Reconstruction filters that add a sample
-    to several pixels make the signs of neighbours alike.
+    Reconstruction filters that add a sample to several pixels make the signs of neighbours alike, others with
+    negative lobes unlike.
     """
-    signs = np.sign(channel_mean(halves[0] - halves[1])[:, :, 0])
-    for products in (signs[1:] * signs[:-1], signs[:, 1:] * signs[:, :-1]):
-        count = int(np.count_nonzero(products))
-        allowed = _ALIKE + _STANDARD_ERRORS / math.sqrt(max(count, 1))
-        if float(products.sum()) > allowed * count:
+    signs = np.sign(channel_mean(halves[0] - halves[1])[:, :, 0]).astype(np.float64)
+    for first, second in ((signs[1:], signs[:-1]), (signs[:, 1:], signs[:, :-1])):
+        differ = first * second != 0
+        count = int(np.count_nonzero(differ))
+        if count == 0:
+            continue
+        # Halves of unequal numbers of samples have one sign more often than the other.
+        alike = float((first * second).sum()) / count - float(first[differ].mean() * second[differ].mean())
+        if abs(alike) > _ALIKE + _STANDARD_ERRORS / math.sqrt(count):
             return False
     return True
 
 
-def regrouped(image: HalvedImage, seed: int, index: int) -> HalvedImage:
+def regrouped(image: HalvedImage, seed: int) -> HalvedImage:
     """Return the image with its halves swapped in half of the pixels, chosen at random.
 
-    Where pixels are independent, these are two other halves of the samples. Another ``index`` chooses others.
+    Where pixels are independent, these are two other halves of the samples.
     """
     buffers = image.buffers
-    chosen = np.random.default_rng([seed, index]).random((buffers.height, buffers.width, 1)) < 0.5
+    chosen = np.random.default_rng(seed).random((buffers.height, buffers.width, 1)) < 0.5
 
     def swapped(buffer: Buffer) -> Buffer:
         if buffer.halves is None:
