@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -48,14 +46,6 @@ def pytest_configure() -> None:
 def render() -> SyntheticRender:
     """The synthetic render at its default size."""
     return synthetic_render()
-
-
-@pytest.fixture
-def _sigint_interrupts() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT, also where a background job was started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

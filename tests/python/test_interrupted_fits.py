@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 from concurrent.futures import wait
 from contextlib import suppress
 from dataclasses import replace
@@ -39,6 +40,14 @@ def test_ctrl_c_during_the_training_returns_what_was_reached(render: SyntheticRe
     assert result.interrupted
     assert any(note.startswith(f"interrupted at step {result.iterations}") for note in result.notes)
     assert 1 <= result.iterations < 1000
+
+
+@pytest.fixture
+def _sigint_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT, also where a background job was started with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_does_not_wait_for_the_pilots_of_all_samples(
@@ -99,7 +108,7 @@ def test_ctrl_c_after_the_training_leaves_what_was_trained(
 
 
 @pytest.mark.usefixtures("_sigint_interrupts")
-@pytest.mark.parametrize("preset", ["draft", "balanced"])
+@pytest.mark.parametrize("preset", ["draft", "balanced", "final"])
 def test_ctrl_c_while_the_image_is_made_waits_for_it(
     preset: Preset, render: SyntheticRender, monkeypatch: pytest.MonkeyPatch
 ) -> None:

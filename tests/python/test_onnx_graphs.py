@@ -57,12 +57,12 @@ def test_inference_mixes_all_samples_as_the_fit_does_whatever_its_time_budget(fr
 
 
 def test_inference_means_over_members_as_the_fit_does(frame: SyntheticRender) -> None:
-    fitted = denoise(frame.buffers, replace(DRAFT, preset="balanced", iterations=5))
+    fitted = denoise(frame.buffers, replace(DRAFT, preset="final", iterations=5))
     assert fitted.model is not None
     onnx.checker.check_model(proto_from_model(fitted.model), full_check=True)
     inferred = infer(fitted.model, frame.buffers, threads=1)
     np.testing.assert_allclose(inferred.color, fitted.color, rtol=1e-4, atol=1e-5)
-    again = denoise(frame.buffers, replace(DRAFT, preset="balanced", iterations=5), warm_start=fitted.model)
+    again = denoise(frame.buffers, replace(DRAFT, preset="final", iterations=5), warm_start=fitted.model)
     assert again.model is not None
     assert again.model.weights["layer1.bias"].shape == fitted.model.weights["layer1.bias"].shape
 

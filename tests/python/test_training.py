@@ -17,7 +17,7 @@ from tungsten_dip.fit.settings import Preset
 
 def test_the_pixels_that_tell_the_error_are_not_trained_on(render: SyntheticRender) -> None:
     evidence, cues = evidence_of(render.buffers, DRAFT_PILOTS)
-    start = start_of_training(evidence, cues, 0, 1)
+    start = start_of_training(evidence, cues, 0, None, 1)
     probe, trained = training._probe(start, np.random.default_rng(0))
     half_a = start.evidence.candidates.noisy[0].reshape(-1, 3)
     told = probe.candidates.noisy[0]
@@ -64,7 +64,7 @@ def test_steps_get_smaller_towards_the_end_of_the_time_budget(
 
 @pytest.mark.parametrize(
     ("preset", "time_budget_s", "members", "steps"),
-    [("balanced", None, 2, 160), ("balanced", 1e6, 1, 240), ("final", None, 4, 240), ("final", 1e6, 1, 240)],
+    [("balanced", None, 2, 160), ("balanced", 1e6, 1, 240), ("final", None, 6, 240), ("final", 1e6, 1, 240)],
 )
 def test_a_time_budget_is_spent_on_one_network(
     preset: Preset, time_budget_s: float | None, members: int, steps: int

@@ -37,7 +37,7 @@ PILOTS = (Pilot("features", 1), Pilot("features", 3))
 
 def examples_for_training(seed: int = 0) -> tuple[Examples, Layout]:
     evidence, cues = evidence_of(synthetic_render(24, 20, seed=seed).buffers, PILOTS)
-    return start_of_training(evidence, cues, seed, 1).examples, evidence.layout
+    return start_of_training(evidence, cues, seed, None, 1).examples, evidence.layout
 
 
 @pytest.mark.parametrize("pixels", [1, 37, 480])

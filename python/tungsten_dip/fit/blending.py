@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Event
 from types import TracebackType
 from typing import Self
@@ -20,25 +20,20 @@ from tungsten_dip.cores import in_pair, thread_count
 from tungsten_dip.fit.candidates import Candidates
 from tungsten_dip.fit.clock import Clock
 from tungsten_dip.fit.evidence import evidence_from_buffers
-from tungsten_dip.fit.model import Blend, Model, Weights, source_sha256
-from tungsten_dip.fit.network.blend_network import BlendNetwork, joined_members
+from tungsten_dip.fit.model import Model, source_sha256
+from tungsten_dip.fit.network.blend_network import BlendNetwork
 from tungsten_dip.fit.network.training import Training, start_of_training, train
 from tungsten_dip.fit.output.all_samples import pilots_of_all_samples
-from tungsten_dip.fit.output.denoised import denoised_image, image_without_noise, mean_of_images
-from tungsten_dip.fit.preparation.splitting import (
-    HalvedImage,
-    are_pixels_independent,
-    regrouped,
-    with_independent_halves,
-)
-from tungsten_dip.fit.presets import Recipe, pilots_for_size, recipe_of, steps_for_size
+from tungsten_dip.fit.output.denoised import denoised_image, image_without_noise
+from tungsten_dip.fit.preparation.splitting import with_independent_halves
+from tungsten_dip.fit.presets import pilots_for_size, recipe_of, steps_for_size
 from tungsten_dip.fit.result import DenoisedImage, FitResult
 from tungsten_dip.fit.settings import FitSettings
 from tungsten_dip.fit.stages import stage
 from tungsten_dip.interrupts import interrupts_as_requests, wait_in_short_turns
-from tungsten_dip.progress import Progress, part_of
+from tungsten_dip.progress import Progress
 
-_FINISHING = "interrupted: making the image of what was reached; press Ctrl-C again to give it up"
+_FINISHING = "interrupted: the image is being made of what was reached; press Ctrl-C again to give it up"
 
 
 def fit_blend(
@@ -58,8 +53,9 @@ def fit_blend(
     the shape of the colour, NaN where they have no value. They are an extra pilot, with which fewer others
     are needed.
 
-    Ctrl-C during a training ends the fit early. The pilots of all samples are then used if they are complete,
-    else given up: the image is made of the halves alone. Ctrl-C while an image is made ends the fit after it.
+    Ctrl-C during the training or after it ends the fit early. The pilots of all samples are then used if they
+    are complete, else given up: the image is made of the halves alone. A second one while the image is made
+    ends the process.
     """
     clock, threads = Clock(settings.time_budget_s), thread_count(settings.threads)
     unchanged = image_without_noise(buffers, threads)
@@ -68,124 +64,57 @@ def fit_blend(
         return result_from_image(unchanged, settings, clock)
     halved = with_independent_halves(buffers, settings.seed, threads)
     recipe = recipe_of(settings, following=previous is not None)
-    if warm_start is not None or not are_pixels_independent(halved.halves):
-        recipe = replace(recipe, regroups=False)
-    fitter = _Fitter(settings, recipe, clock, threads, warm_start, previous, refit_steps)
-    fits = [fitter.fit(halved, part_of(progress, 0, 0.5) if recipe.regroups else progress)]
-    first, training = fits[0], fits[0].training
-    if recipe.regroups and not training.interrupted and not training.stopped:
-        try:
-            again = fitter.fit(regrouped(halved, settings.seed), part_of(progress, 0.5, 1), first)
-        except KeyboardInterrupt:
-            training.interrupted = True
-        else:
-            training.interrupted = again.training.interrupted
-            if again.training.steps_done == training.steps_done:
-                fits.append(again)
-    if recipe.regroups and training.interrupted and len(fits) == 1:
-        training.notes.append("interrupted: the samples were grouped into halves once instead of twice")
+    blend = None if warm_start is None else warm_start.blend
+    plan = pilots_for_size(recipe.pilots, buffers.width, buffers.height) if blend is None else blend.layout
+    with_oidn = settings.pilot == "oidn"
+    evidence, cues = evidence_from_buffers(
+        halved, plan, clock, progress, threads=threads, with_oidn=with_oidn, previous=previous
+    )
+    start = start_of_training(evidence, cues, settings.seed, warm_start, recipe.members)
+    evidence = start.evidence
+    del cues  # Large images need gigabytes for them.
+    if start.warm and refit_steps is not None:
+        settings = replace(settings, iterations=refit_steps)
+    network = BlendNetwork(evidence.layout, start.weights, settings.device, threads)
+
+    def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
+        if not recipe.all_samples:
+            return ()
+        return pilots_of_all_samples(evidence, halved.buffers, clock, with_oidn=with_oidn, given_up=given_up)
+
+    with _AllSamplesPilots(pilots_beside) as beside:
+        # Each network keeps one core busy; these pilots take what is left of all of them.
+        if threads == 1:
+            beside.result()
+        steps = settings.iterations or steps_for_size(recipe.steps, buffers.width, buffers.height)
+        training = train(
+            network, start, settings, steps, recipe.batch_pixels, clock, stage(progress, "training")
+        )
+        all_samples_pilots = beside.result_after(training)
+    if training.interrupted and recipe.all_samples and not all_samples_pilots:
+        training.notes.append("without the pilots of all samples: the image is made of the halves alone")
     with interrupts_as_requests(_FINISHING) as requested:
-        image = mean_of_images([fit.image for fit in fits])
+        inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
+        blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
+        image = denoised_image(evidence, *blended)
         model = Model(
-            inputs=first.blend.layout.inputs,
-            weights=joined_members([fit.weights for fit in fits]),
-            settings=first.settings,
+            inputs=evidence.layout.inputs,
+            weights=network.weights(),
+            settings=settings,
             estimated_relmse=image.estimated_relmse,
             source_sha256=source_sha256(buffers),
-            blend=first.blend,
+            blend=start.blend,
         )
     training.interrupted |= requested()
     if not training.interrupted:
         progress(1.0, f"relMSE {image.estimated_relmse:.4g}")
     return replace(
-        result_from_image(image, first.settings, clock, halved.drawn, model),
+        result_from_image(image, settings, clock, evidence.halves_drawn, model),
         iterations=training.steps_done,
         history=tuple(training.history),
         interrupted=training.interrupted,
         notes=(*image.notes, *training.notes),
     )
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """What a fit to one pair of halves gives; ``weights`` are those of its members."""
-
-    image: DenoisedImage
-    weights: Weights
-    blend: Blend
-    settings: FitSettings
-    training: Training
-    all_samples_pilots: tuple[FloatImage, ...]
-
-
-@dataclass(frozen=True)
-class _Fitter:
-    """Fits a network to a pair of halves of an image; the fields are those of `fit_blend`."""
-
-    settings: FitSettings
-    recipe: Recipe
-    clock: Clock
-    threads: int
-    warm_start: Model | None
-    previous: Halves | None
-    refit_steps: int | None
-
-    def fit(self, image: HalvedImage, progress: Progress, first: _Fit | None = None) -> _Fit:
-        """Fit a network to the halves of an image.
-
-        If the ``first`` fit was to other halves, its layout, standardisation and pilots of all samples are
-        used again: the networks of both are one.
-        """
-        settings, recipe, threads = self.settings, self.recipe, self.threads
-        width, height = image.buffers.width, image.buffers.height
-        if first is not None:
-            blend: Blend | None = first.blend
-        else:
-            blend = None if self.warm_start is None else self.warm_start.blend
-        plan = pilots_for_size(recipe.pilots, width, height) if blend is None else blend.layout
-        with_oidn = settings.pilot == "oidn"
-        evidence, cues = evidence_from_buffers(
-            image, plan, self.clock, progress, threads=threads, with_oidn=with_oidn, previous=self.previous
-        )
-        if first is None:
-            seed, beside = settings.seed, None
-        else:
-            seed, beside = settings.seed + 1, first.blend
-        members = recipe.members // 2 if recipe.regroups else recipe.members
-        start = start_of_training(evidence, cues, seed, members, self.warm_start, beside)
-        evidence = start.evidence
-        del cues  # Large images need gigabytes for them.
-        if start.warm and self.refit_steps is not None:
-            settings = replace(settings, iterations=self.refit_steps)
-        network = BlendNetwork(evidence.layout, start.weights, settings.device, threads)
-
-        def pilots_beside(given_up: Event) -> tuple[FloatImage, ...]:
-            if first is not None:
-                return first.all_samples_pilots
-            if not recipe.all_samples:
-                return ()
-            return pilots_of_all_samples(
-                evidence, image.buffers, self.clock, with_oidn=with_oidn, given_up=given_up
-            )
-
-        with _AllSamplesPilots(pilots_beside) as beside_training:
-            # Each network keeps one core busy; these pilots take what is left of all of them.
-            if threads == 1:
-                beside_training.result()
-            steps = settings.iterations or steps_for_size(recipe.steps, width, height)
-            training = train(
-                network, start, settings, steps, recipe.batch_pixels, self.clock, stage(progress, "training")
-            )
-            all_samples_pilots = beside_training.result_after(training)
-        if training.interrupted and recipe.all_samples and not all_samples_pilots:
-            training.notes.append("without the pilots of all samples: the image is made of the halves alone")
-        with interrupts_as_requests(_FINISHING) as requested:
-            inputs = start.examples.inputs.reshape(2, -1, len(evidence.layout.inputs))
-            blended = blended_images(network, inputs, evidence.candidates, all_samples_pilots, threads)
-            denoised = denoised_image(evidence, *blended)
-            weights = network.weights()
-        training.interrupted |= requested()
-        return _Fit(denoised, weights, start.blend, settings, training, all_samples_pilots)
 
 
 class _AllSamplesPilots:

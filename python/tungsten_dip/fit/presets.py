@@ -66,8 +66,7 @@ class Recipe:
     """What a preset computes.
 
     A network of so many ``members`` blends the ``pilots`` and is trained for ``steps`` steps of
-    ``batch_pixels`` pixels. ``all_samples``: the pilots are computed from all samples, too. All of it is done
-    again if it ``regroups`` the samples into other halves, with half of the members for either pair.
+    ``batch_pixels`` pixels. ``all_samples``: the pilots are computed from all samples, too.
     """
 
     pilots: tuple[Pilot, ...]
@@ -75,13 +74,12 @@ class Recipe:
     batch_pixels: int = _BATCH_PIXELS
     members: int = 1
     all_samples: bool = True
-    regroups: bool = False
 
 
 RECIPES = {
     "draft": Recipe(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, all_samples=False),
     "balanced": Recipe(BALANCED_PILOTS, 160, members=2),
-    "final": Recipe(FINAL_PILOTS, 240, members=4, regroups=True),
+    "final": Recipe(FINAL_PILOTS, 240, members=6),
 }
 
 
@@ -95,7 +93,7 @@ def recipe_of(settings: FitSettings, *, following: bool) -> Recipe:
     if settings.time_budget_s is not None:
         if recipe.members > 1:
             # The time is better spent on the steps of one network.
-            recipe = replace(recipe, members=1, steps=STEPS_OF_ONE_NETWORK, regroups=False)
+            recipe = replace(recipe, members=1, steps=STEPS_OF_ONE_NETWORK)
         # Those of draft are enough by themselves where there is no time for others.
         others = tuple(pilot for pilot in recipe.pilots if pilot not in DRAFT_PILOTS)
         recipe = replace(recipe, pilots=(*DRAFT_PILOTS, *others))

@@ -39,8 +39,7 @@ class FitResult:
     presets balanced and final moved towards the pilots of all samples, and then multiplied by the ``gain``.
     ``estimated_relmse`` is the estimated relMSE (with epsilon 0.01) of the mean of ``halves``, and ``error``
     its estimated relative squared error around every pixel, shape (height, width, 1), the mean over 9x9
-    pixels. ``halves`` and both errors are None with the preset paper. With the preset final, ``color``,
-    both errors and the ``gain`` are means of two such images, and ``halves`` are those of the first.
+    pixels. ``halves`` and both errors are None with the preset paper.
     ``gain``, shape (height, width, 1), gives back some of the radiance of fireflies (`fireflies`); None
     without fireflies. The errors do not include what is lost of it.
     ``halves_drawn`` indicates that the image came without independent halves, which were drawn from it

@@ -12,7 +12,7 @@ once. The number of pixels is free.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -211,11 +211,6 @@ class BlendNetwork:
 def members_of(weights: Weights) -> int:
     """Return how many members have these weights, at least 1 also for weights that are no network's."""
     return max(np.size(weights.get("layer1.bias", ())) // HIDDEN, 1)
-
-
-def joined_members(parts: Sequence[Weights]) -> Weights:
-    """Return the weights of the members of all networks, which have the same layout, as one network's."""
-    return {name: np.concatenate([weights[name] for weights in parts]) for name in parts[0]}
 
 
 def _forward(inputs: int, candidates: int) -> onnx.ModelProto:

@@ -66,18 +66,10 @@ class Start:
     notes: tuple[str, ...] = ()
 
 
-def start_of_training(
-    evidence: Evidence,
-    cues: Cues,
-    seed: int,
-    members: int,
-    model: Model | None = None,
-    beside: Blend | None = None,
-) -> Start:
+def start_of_training(evidence: Evidence, cues: Cues, seed: int, model: Model | None, members: int) -> Start:
     """Return the examples, and the weights of ``model`` or, if its image was too different, new ones.
 
-    New weights are those of so many ``members`` (`fit.network.blend_network`). Those that are to be of one
-    network with others have their layout and standardisation, ``beside``.
+    New weights are those of so many ``members`` (`fit.network.blend_network`).
     """
     inputs = network_inputs(evidence.layout, evidence.candidates, cues, evidence.threads)
     notes: tuple[str, ...] = ()
@@ -89,9 +81,10 @@ def start_of_training(
         notes = ("the image is too unlike the model's: a new network is fitted",)
         evidence, cues = with_best_baseline(evidence, cues)
         inputs = network_inputs(evidence.layout, evidence.candidates, cues, evidence.threads)
-    blend = beside or Blend(evidence.layout, standardisation_of(inputs, evidence.threads))
-    blend.standardisation.apply(inputs, evidence.threads)
-    weights = first_weights(blend.layout, seed, members)
+    standardisation = standardisation_of(inputs, evidence.threads)
+    standardisation.apply(inputs, evidence.threads)
+    weights = first_weights(evidence.layout, seed, members)
+    blend = Blend(evidence.layout, standardisation)
     return _start(evidence, cues, inputs, blend, weights, warm=False, notes=notes)
 
 
@@ -174,11 +167,10 @@ def _probe(start: Start, rng: np.random.Generator) -> tuple[_Probe, Indices]:
 
 @dataclass
 class Training:
-    """How far a training went; ``stopped`` if a target or a budget ended it."""
+    """How far a training went."""
 
     steps_done: int = 0
     interrupted: bool = False
-    stopped: bool = False
     history: list[HistoryPoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -249,7 +241,6 @@ def train(
                 stopping.record(step, held_out, network)
             reason = _reason_to_stop(error, settings, clock, stopping)
             if reason is not None:
-                done.stopped = True
                 done.notes.append(f"stopped at step {step}: {reason}")
                 break
     except KeyboardInterrupt:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
 from tungsten_dip import _core
@@ -62,27 +59,6 @@ def image_without_noise(buffers: RenderBuffers, threads: int) -> DenoisedImage |
         estimated_relmse=float(error.mean(dtype=np.float64)),
         notes=(f"{why}: the image is returned as it is",),
     )
-
-
-def mean_of_images(images: Sequence[DenoisedImage]) -> DenoisedImage:
-    """Return the mean of images of one render and of their errors, and halves and notes of the first."""
-    first = images[0]
-    if len(images) == 1:
-        return first
-    gains = [np.ones_like(image.error) if image.gain is None else image.gain for image in images]
-    gain = _mean(gains)
-    return replace(
-        first,
-        color=gain * _mean([image.color / own for image, own in zip(images, gains, strict=True)]),
-        error=_mean([image.error for image in images]),
-        estimated_relmse=sum(image.estimated_relmse for image in images) / len(images),
-        gain=None if all(image.gain is None for image in images) else gain,
-    )
-
-
-def _mean(images: Sequence[FloatImage]) -> FloatImage:
-    mean: FloatImage = np.mean(images, axis=0, dtype=np.float32)
-    return mean
 
 
 def denoised_image(

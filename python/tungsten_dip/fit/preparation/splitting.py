@@ -14,7 +14,6 @@ scoring one by the other needs. Below, "shape" without more is this k, of Beta.
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,10 +59,6 @@ _SAMPLES_OF_RIM = 4.0
 """If a part p of n samples hits a lamp at its rim, the number of hits is split among halves with a variance
 that is about Beta's for the shape n p / (1 - p) (hypergeometric). Images of few samples need it most."""
 
-_ALIKE = 0.05
-_STANDARD_ERRORS = 4.0
-"""The signs of neighbours' noise may have this correlation, and so many standard errors more."""
-
 _LARGEST_SHAPE = 1e8
 """Both halves of such a pixel are the same to float32's last digits: it has no noise."""
 
@@ -103,43 +98,6 @@ def with_independent_halves(buffers: RenderBuffers, seed: int, threads: int) -> 
         f"two; the estimated error may be too low"
     )
     return HalvedImage(_with_drawn_halves(buffers, seed, threads), drawn=True, notes=(note,))
-
-
-def are_pixels_independent(halves: Halves) -> bool:
-    """Whether the noise of neighbouring pixels is independent, as far as its signs tell.
-
-    Reconstruction filters that add a sample to several pixels make the signs of neighbours alike, others with
-    negative lobes unlike.
-    """
-    signs = np.sign(channel_mean(halves[0] - halves[1])[:, :, 0]).astype(np.float64)
-    for first, second in ((signs[1:], signs[:-1]), (signs[:, 1:], signs[:, :-1])):
-        differ = first * second != 0
-        count = int(np.count_nonzero(differ))
-        if count == 0:
-            continue
-        # Halves of unequal numbers of samples have one sign more often than the other.
-        alike = float((first * second).sum()) / count - float(first[differ].mean() * second[differ].mean())
-        if abs(alike) > _ALIKE + _STANDARD_ERRORS / math.sqrt(count):
-            return False
-    return True
-
-
-def regrouped(image: HalvedImage, seed: int) -> HalvedImage:
-    """Return the image with its halves swapped in half of the pixels, chosen at random.
-
-    Where pixels are independent, these are two other halves of the samples.
-    """
-    buffers = image.buffers
-    chosen = np.random.default_rng(seed).random((buffers.height, buffers.width, 1)) < 0.5
-
-    def swapped(buffer: Buffer) -> Buffer:
-        if buffer.halves is None:
-            return buffer
-        a, b = buffer.halves
-        return replace(buffer, half_a=np.where(chosen, b, a), half_b=np.where(chosen, a, b))
-
-    quantities = {name: swapped(buffer) for name, buffer in buffers.quantities()}
-    return replace(image, buffers=buffers.with_quantities(**quantities))
 
 
 def with_lost_halves_drawn(
