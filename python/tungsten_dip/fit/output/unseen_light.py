@@ -19,7 +19,12 @@ from tungsten_dip.fit.preparation.exposure import BLACK
 _BRIGHTER = 2.0
 """Results brighter than so many times the noisy pixel may contain light that is not there."""
 
+_LEAST_PART = 0.05
+"""Results are uncertain by smaller parts anyway."""
+
 _LARGEST_PART = 0.98
+"""Nothing is certain of a light after finitely many samples."""
+
 _STANDARD_ERRORS = 2.0
 """So many standard errors are subtracted from the number of pixels without light."""
 
@@ -51,8 +56,9 @@ def without_unseen_light(
         """Return which of the unseen pixels have light in the result, and the probability to miss it."""
         level, dark = channel_mean(result), channel_mean(pixel)
         chosen = rim & unseen & (level > _BRIGHTER * (dark + np.float32(BLACK)))
-        part = (level - dark)[chosen] / np.maximum(brightest - dark, np.float32(1e-15))[chosen]
-        probability: _Floats = (1 - np.clip(part.astype(np.float64), 0, _LARGEST_PART)) ** samples
+        part = (level - dark) / np.maximum(brightest - dark, np.float32(1e-15))
+        chosen &= part > _LEAST_PART
+        probability: _Floats = (1 - np.minimum(part[chosen].astype(np.float64), _LARGEST_PART)) ** samples
         return chosen, probability
 
     excess, expected, count = 0.0, 0.0, 0
