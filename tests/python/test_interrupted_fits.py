@@ -181,12 +181,17 @@ def test_an_error_in_training_does_not_wait_for_the_pilots_of_all_samples(
 def test_a_termination_that_was_lost_is_raised_when_asked_or_at_the_end(asks: bool) -> None:
     """Python ignores exceptions in finalisers."""
     done = []
-    with pytest.raises(KeyboardInterrupt), interrupts.terminations_as_interrupts() as raise_if_asked:  # noqa: PT012
-        raise_if_asked()
-        with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGTERM)
-        done.append("one")
-        if asks:
+
+    def work() -> None:
+        with interrupts.terminations_as_interrupts() as raise_if_asked:
             raise_if_asked()
-        done.append("another")
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+            done.append("one")
+            if asks:
+                raise_if_asked()
+            done.append("another")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
     assert done == (["one"] if asks else ["one", "another"])

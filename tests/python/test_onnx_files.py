@@ -25,7 +25,7 @@ PILOTS = sorted(
     {
         pilot
         for preset, following in itertools.product(RECIPES, (False, True))
-        for pilot in recipe_of(FitSettings(preset), following=following).pilots  # type: ignore[arg-type]
+        for pilot in recipe_of(FitSettings(preset), following=following).pilots
     },
     key=repr,
 )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.pilots.surfaces import EDGES_SIGMA
-from tungsten_dip.fit.settings import FitSettings
+from tungsten_dip.fit.settings import FitSettings, Preset
 
 _EDGES = Pilot("edges", EDGES_SIGMA)
 
@@ -76,7 +76,7 @@ class Recipe:
     all_samples: bool = True
 
 
-RECIPES = {
+RECIPES: dict[Preset, Recipe] = {
     "draft": Recipe(DRAFT_PILOTS, 80, _SMALL_BATCH_PIXELS, all_samples=False),
     "balanced": Recipe(BALANCED_PILOTS, 160, members=2),
     "final": Recipe(FINAL_PILOTS, 240, members=6),

@@ -38,10 +38,10 @@ def without_unseen_light(
 ) -> tuple[Halves, FloatImage]:
     """Return both halves' results and the image, nearer to the noisy ones where they have unseen light.
 
-    All but ``light`` are linear radiance of shape (height, width, 3); ``light`` is what the samples of each
-    half saw directly of lights, shape (height, width, 1). Of the pixels beside a light that one half did not
-    see, the other half misses it more often than the results allow: this excess is the probability that there
-    is none. By Bayes' rule follows that of a pixel that both halves missed.
+    All are linear radiance in the units of `evidence.Evidence`, of shape (height, width, 3); but ``light``,
+    what the samples of each half saw directly of lights, has one channel. Of the pixels beside a light that
+    one half did not see, the other half misses it more often than the results allow: this excess is the
+    probability that there is none. By Bayes' rule follows that of a pixel that both halves missed.
     """
     seen, mean = mean_of(light), mean_of(noisy)
     brightest = largest_around(np.where(seen > 0, channel_mean(mean), np.float32(0)), 1)
@@ -76,12 +76,8 @@ def without_unseen_light(
     share: FloatImage = np.zeros_like(seen)
     share[chosen] = prior / (prior + (1 - prior) * probability)
 
-    def darkened(result: FloatImage, pixel: FloatImage) -> FloatImage:
-        darker: FloatImage = result + share * np.minimum(pixel - result, np.float32(0))
-        return darker
-
-    a, b = (darkened(result, half) for result, half in zip(denoised, noisy, strict=True))
-    return (a, b), darkened(image, mean)
+    a, b = (result + share * (half - result) for result, half in zip(denoised, noisy, strict=True))
+    return (a, b), image + share * (mean - image)
 
 
 def _samples(light: Halves, seen: FloatImage, rim: npt.NDArray[np.bool_]) -> float:
