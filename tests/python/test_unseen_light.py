@@ -27,7 +27,7 @@ def _smeared(without_light: float, seed: int) -> tuple[FloatImage, FloatImage, F
     missing = np.random.default_rng(seed).random(part.shape) < without_light
     part[missing & (part < 1)] = 0
     noisy, light = _columns(part, 8, seed)
-    halves, image = without_unseen_light(noisy, (result, result), result, light)
+    halves, image = without_unseen_light(noisy, (result, result), result, light, 2)
     assert all((half <= result).all() for half in halves)
     return np.float32(part * SKY + DARK)[..., None].repeat(3, axis=2), result, image
 
@@ -51,6 +51,6 @@ def test_an_image_without_rims_stays() -> None:
     dark, lamp = (np.full((1, 1, 3), value, np.float32) for value in (DARK, SKY))
     for image in (dark, lamp):
         light = np.maximum(image[..., :1] - 1, 0)
-        halves, result = without_unseen_light((image, image), (image, image), image, (light, light))
+        halves, result = without_unseen_light((image, image), (image, image), image, (light, light), 2)
         np.testing.assert_array_equal(result, image)
         np.testing.assert_array_equal(halves, (image, image))

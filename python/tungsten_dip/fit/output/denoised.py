@@ -78,7 +78,7 @@ def denoised_image(
         with_detail = np.maximum(all_samples_blend + (image - blended), 0)
         image = with_all_samples(denoised, with_detail, threads)
     if evidence.light is not None:
-        denoised, image = without_unseen_light(noisy, denoised, image, evidence.light)
+        denoised, image = without_unseen_light(noisy, denoised, image, evidence.light, threads)
     if not evidence.halves_drawn:
         light = gain_of_lost_light(noisy, mean_of(denoised), threads)
         light_of_all = light if all_samples_blend is None else gain_of_lost_light(noisy, image, threads)

@@ -3,7 +3,8 @@
 Beside lamps and the sky, filters estimate from the pixels along an edge which part of a pixel the light
 fills. Where the edge ends or bends, as at the tip of a dark post before the sky, that part is too large. The
 samples of the pixel itself tell: all n of them miss a light that fills the part p of it with probability
-(1 - p)^n.
+(1 - p)^n. Which part it fills is known only beside pixels that it fills entirely, and not of a lamp that
+smooth plastic reflects in one of many samples.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from tungsten_dip import _core
 from tungsten_dip.buffers.channels import channel_mean
 from tungsten_dip.buffers.render_buffers import FloatImage, Halves, mean_of
 from tungsten_dip.fit.neighbours import largest_around
@@ -30,11 +32,19 @@ _STANDARD_ERRORS = 2.0
 
 _MOST_SAMPLES = 1e4
 
+_FILLED_RADIUS = 2
+_FILLED = 0.6
+"""A light fills a pixel if its halves have at least so much of one another's light, and of the brightest one
+around: they differ by no more than texture."""
+
+_FILLED_OVER_CHANCE = 2.0
+"""Beside a light in plain view, there are so many times more such pixels than those it hit in one half only."""
+
 _Floats = npt.NDArray[np.float64]
 
 
 def without_unseen_light(
-    noisy: Halves, denoised: Halves, image: FloatImage, light: Halves
+    noisy: Halves, denoised: Halves, image: FloatImage, light: Halves, threads: int
 ) -> tuple[Halves, FloatImage]:
     """Return both halves' results and the image, nearer to the noisy ones where they have unseen light.
 
@@ -45,7 +55,7 @@ def without_unseen_light(
     """
     seen, mean = mean_of(light), mean_of(noisy)
     brightest = largest_around(np.where(seen > 0, channel_mean(mean), np.float32(0)), 1)
-    rim = (brightest > 0) & (-largest_around(-seen, 1) == 0)
+    rim = (brightest > 0) & (-largest_around(-seen, 1) == 0) & _beside_filled(light, threads)
     if not rim.any():
         return denoised, image
     samples = _samples(light, seen, rim) / 2
@@ -78,6 +88,17 @@ def without_unseen_light(
 
     a, b = (result + share * (half - result) for result, half in zip(denoised, noisy, strict=True))
     return (a, b), image + share * (mean - image)
+
+
+def _beside_filled(light: Halves, threads: int) -> npt.NDArray[np.bool_]:
+    """Return around which pixels the light fills many entirely, compared to those that it hit by chance."""
+    darker, brighter = np.minimum(*light), np.maximum(*light)
+    filled = (darker > 0) & (darker >= np.float32(_FILLED) * brighter)
+    filled &= mean_of(light) >= np.float32(_FILLED) * largest_around(mean_of(light), _FILLED_RADIUS)
+    chance = (darker == 0) & (brighter > 0)
+    more = filled - np.float32(_FILLED_OVER_CHANCE) * chance
+    beside: npt.NDArray[np.bool_] = _core.box_mean(more, _FILLED_RADIUS, threads) > 0
+    return beside
 
 
 def _samples(light: Halves, seen: FloatImage, rim: npt.NDArray[np.bool_]) -> float:
