@@ -26,6 +26,10 @@ absolute differences that are visible, not relative ones."""
 _GUIDE_VARIANCE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
+_GUIDED_SIGMA = 3
+"""Standard deviation, in pixels, of the mean along edges that guided pilots become. The features and guides of
+one pixel by themselves leave edges frayed, such as thin bars before a bright sky."""
+
 _SAMPLES_OF_GUIDE = 12
 """About how many independent pixels a guide of all samples averages: no second half is left to estimate its
 noise, which is taken to be that of the image divided by this."""
@@ -99,9 +103,15 @@ class PilotMaker:
                 surfaces, guides = self._of_color
             case "features" | "guided":
                 surfaces, guides = self.surfaces, self.guides
-        return tuple(
+        images = tuple(
             s.color(_regress(image, pilot, s, self.threads, guide, guides.variance))
             for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
+        )
+        if pilot.kind != "guided":
+            return images
+        return tuple(
+            along_edges(image, s.edges, _GUIDED_SIGMA, self.threads)
+            for image, s in zip(images, surfaces, strict=True)
         )
 
     @cached_property
