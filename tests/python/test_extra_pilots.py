@@ -28,7 +28,7 @@ def test_a_bad_extra_pilot_does_little_harm(render: SyntheticRender, oidn_images
     oidn_images[:] = np.zeros_like(render.reference), 10 * render.reference
     together = denoise(render.buffers, short(iterations=80, pilot="oidn"))
     check_result(together, render.buffers)
-    assert relmse(together.color, render.reference) < 1.3 * relmse(alone.color, render.reference)
+    assert relmse(together.color, render.reference) < 1.5 * relmse(alone.color, render.reference)
 
 
 def test_the_previous_frame_is_a_pilot_where_it_shows_something(render):

@@ -90,7 +90,8 @@ def test_halves_are_tested_alike_at_any_exposure(exponent: int) -> None:
 def test_a_learning_rate_too_high_does_no_harm(preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tungsten_dip.fit.network.training.LEARNING_RATE", 1.0)
     result = denoise(healthy().buffers, replace(DRAFT, preset=preset))
-    assert not measure(result, healthy()).broken(HardCase("Settings", preset, healthy))
+    any_pilots = {"mean": "weights that jump about end at any blend of pilots"}
+    assert not measure(result, healthy()).broken(HardCase("Settings", preset, healthy, any_pilots))
 
 
 def test_the_published_method_survives_a_learning_rate_too_high(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -169,7 +169,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (many_nodes, "too many parts"),
     (long_name, "beside the weights"),
     (no_metadata, "tungsten-dip wrote"),
-    (metadata('"format": 8', '"format": 1'), "expected format 8, found 1"),
+    (metadata('"format": 9', '"format": 1'), "expected format 9, found 1"),
     (metadata('"preset": "draft"', '"preset": "paper"'), "weight|network"),
     (metadata('"extra_pilots": 0', '"extra_pilots": 1000000000000'), "extra_pilots: expected at most 2"),
     (metadata('"extra_pilots": 0', '"extra_pilots": 3'), "extra_pilots: expected at most 2, found 3"),
@@ -201,7 +201,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (metadata('"step": 1', '"step": true'), "constants or attributes"),
     (metadata('"estimated_relmse": ', '"estimated_relmse": 1e400, "was": '), "estimated_relmse: found inf"),
     (metadata('"estimated_relmse": ', f'"estimated_relmse": {10**400}, "was": '), "relmse: found 1000"),
-    (metadata('"format": 8', f'"format": {10**400}'), "expected format 8, found 1000"),
+    (metadata('"format": 9', f'"format": {10**400}'), "expected format 9, found 1000"),
     (metadata('"preset": "draft"', '"preset": ["draft"]'), "preset"),
     (metadata('"channels": [8', '"channels": [-8'), "channels"),
     (metadata('"channels": [8', '"channels": [' + 62 * "8, " + "8"), "channels"),
@@ -213,7 +213,7 @@ HOSTILE: list[tuple[Spoil, str]] = [
     (whole_metadata("[" * 100_000), "JSON"),
     (whole_metadata("{"), "JSON"),
     (whole_metadata("[]"), "format"),
-    (whole_metadata('{"format": 8}'), "settings"),
+    (whole_metadata('{"format": 9}'), "settings"),
 ]
 
 

@@ -38,6 +38,22 @@ def test_a_dark_surface_lights_up_nothing_of_the_empty_space_around() -> None:
         assert image[~surface].max() < 1e-6
 
 
+def test_the_rim_of_a_bright_sky_is_not_frayed() -> None:
+    """Colour and features of a pixel that the sky half fills depend on how many of its samples saw it."""
+    rng = np.random.default_rng(0)
+    part = np.tile(np.float32([1] * 20 + [0.5] + [0] * 19), (64, 1))
+    sky = [rng.binomial(4, part) / 4 for _ in range(2)]
+    halves = rgb_from_plane(0.02 + sky[0]), rgb_from_plane(0.02 + sky[1])
+    depth = buffer_of_halves(*(np.float32(3 * (1 - seen))[:, :, None] for seen in sky))
+    surfaces = surfaces_of(RenderBuffers(buffer_of_halves(*halves), depth=depth))
+    maker = PilotMaker(halves, surfaces, guides_of_colors(halves, surfaces, 1), 1)
+    for image, noisy in zip(maker.images(Pilot("guided", 4, k=1.0)), halves, strict=True):
+        assert image[:, 20].std() < 0.4 * noisy[:, 20].std()
+        assert image[:, 20].mean() == pytest.approx(noisy[:, 20].mean(), rel=0.1)
+        for column in (19, 21):  # neither dimmed nor lit by the other side
+            assert np.abs(image[:, column] - noisy[:, column]).max() < 0.01
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -47,6 +47,19 @@ def test_light_that_is_missed_as_often_as_its_part_tells_stays(seed: int) -> Non
     np.testing.assert_array_equal(image, result)
 
 
+@pytest.mark.parametrize("hits", [0.3, 0.6, 1.0, 2.0])
+def test_a_lamp_that_plastic_reflects_in_some_samples_stays(hits: float) -> None:
+    """Where few pixels saw it, the others are no gaps, whatever the rims of lamps elsewhere show."""
+    part = np.tile(np.float32([0, 0.5, 1]), (60, 30))
+    plastic = np.indices(part.shape)[1] >= 45
+    part[plastic] = hits / 8
+    result = np.float32(part * SKY + DARK)[..., None].repeat(3, axis=2)
+    for seed in range(3):
+        noisy, light = _columns(part, 8, seed)
+        _, image = without_unseen_light(noisy, (result, result), result, light, 2)
+        assert np.abs(image - result)[plastic].mean() < 0.02 * result[plastic].mean()
+
+
 def test_an_image_without_rims_stays() -> None:
     dark, lamp = (np.full((1, 1, 3), value, np.float32) for value in (DARK, SKY))
     for image in (dark, lamp):

@@ -17,8 +17,8 @@ class Pilot:
     """One filter, ``radius`` and ``step`` in pixels. What it does with the pixels around depends on its kind.
 
     - ``features``: a regression on the features, by which neighbours are weighted.
-    - ``guided``: the same, with neighbours weighted by a guide; ``k`` is the damping of non-local means. The
-      regression is averaged along the edges of the features.
+    - ``guided``: the same, with neighbours weighted by a guide; ``k`` is the damping of non-local means. Its
+      result is averaged along the edges of the features.
     - ``color``: guided, without features and albedo, which on mirrors, in glass and out of focus are as noisy
       as the colour.
     - ``edges``: the mean along the edges of the features, with the standard deviation ``radius``. It

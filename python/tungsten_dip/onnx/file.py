@@ -41,7 +41,7 @@ LARGEST_FILE_BYTES = 64 << 20
 LARGEST_STRUCTURE_BYTES = 1 << 20
 """Size of all but the weights: bounds the memory of the parser."""
 
-_FORMAT = 8
+_FORMAT = 9
 """Raised whenever another graph is written, or the same one has other inputs."""
 
 _PROPERTY = "tungsten_dip"

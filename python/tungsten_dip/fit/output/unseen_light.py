@@ -38,7 +38,7 @@ _FILLED = 0.6
 around: they differ by no more than texture."""
 
 _FILLED_OVER_CHANCE = 2.0
-"""Beside a light in plain view, there are so many times more such pixels than those it hit in one half only."""
+"""Beside a light in plain view, so many times more pixels are filled than hit in one half only."""
 
 _Floats = npt.NDArray[np.float64]
 
@@ -54,8 +54,8 @@ def without_unseen_light(
     probability that there is none. By Bayes' rule follows that of a pixel that both halves missed.
     """
     seen, mean = mean_of(light), mean_of(noisy)
-    brightest = largest_around(np.where(seen > 0, channel_mean(mean), np.float32(0)), 1)
-    rim = (brightest > 0) & (-largest_around(-seen, 1) == 0) & _beside_filled(light, threads)
+    brightest = largest_around(np.where(_filled(light, threads), channel_mean(mean), np.float32(0)), 1)
+    rim = (brightest > 0) & (-largest_around(-seen, 1) == 0)
     if not rim.any():
         return denoised, image
     samples = _samples(light, seen, rim) / 2
@@ -90,15 +90,15 @@ def without_unseen_light(
     return (a, b), image + share * (mean - image)
 
 
-def _beside_filled(light: Halves, threads: int) -> npt.NDArray[np.bool_]:
-    """Return around which pixels the light fills many entirely, compared to those that it hit by chance."""
+def _filled(light: Halves, threads: int) -> npt.NDArray[np.bool_]:
+    """Return which pixels a light fills, where it fills many compared to those that it hit by chance."""
     darker, brighter = np.minimum(*light), np.maximum(*light)
     filled = (darker > 0) & (darker >= np.float32(_FILLED) * brighter)
     filled &= mean_of(light) >= np.float32(_FILLED) * largest_around(mean_of(light), _FILLED_RADIUS)
     chance = (darker == 0) & (brighter > 0)
     more = filled - np.float32(_FILLED_OVER_CHANCE) * chance
-    beside: npt.NDArray[np.bool_] = _core.box_mean(more, _FILLED_RADIUS, threads) > 0
-    return beside
+    plain: npt.NDArray[np.bool_] = filled & (_core.box_mean(more, _FILLED_RADIUS, threads) > 0)
+    return plain
 
 
 def _samples(light: Halves, seen: FloatImage, rim: npt.NDArray[np.bool_]) -> float:

@@ -27,8 +27,9 @@ _GUIDE_VARIANCE_RADIUS = 3
 _LEAST_GUIDE_VARIANCE = 1e-5
 
 _GUIDED_SIGMA = 3
-"""Standard deviation, in pixels, of the mean along edges that guided pilots become. The features and guides of
-one pixel by themselves leave edges frayed, such as thin bars before a bright sky."""
+_GUIDED_SIGMA_ACROSS = 0.2
+"""Standard deviations, in pixels, of the mean along edges that guided pilots become: the features and guides
+of single pixels leave edges frayed, such as bars before a bright sky. Across edges nothing is averaged."""
 
 _SAMPLES_OF_GUIDE = 12
 """About how many independent pixels a guide of all samples averages: no second half is left to estimate its
@@ -103,16 +104,16 @@ class PilotMaker:
                 surfaces, guides = self._of_color
             case "features" | "guided":
                 surfaces, guides = self.surfaces, self.guides
-        images = tuple(
-            s.color(_regress(image, pilot, s, self.threads, guide, guides.variance))
+        lit = tuple(
+            s.reflected(_regress(image, pilot, s, self.threads, guide, guides.variance))
             for image, guide, s in zip(guides.irradiances, guides.images, surfaces, strict=True)
         )
-        if pilot.kind != "guided":
-            return images
-        return tuple(
-            along_edges(image, s.edges, _GUIDED_SIGMA, self.threads)
-            for image, s in zip(images, surfaces, strict=True)
-        )
+        if pilot.kind == "guided":
+            lit = tuple(
+                along_edges(image, s.edges, _GUIDED_SIGMA, self.threads, across=_GUIDED_SIGMA_ACROSS)
+                for image, s in zip(lit, surfaces, strict=True)
+            )
+        return tuple(image + s.smooth_emission for image, s in zip(lit, surfaces, strict=True))
 
     @cached_property
     def _of_color(self) -> tuple[tuple[Surfaces, ...], Guides]:

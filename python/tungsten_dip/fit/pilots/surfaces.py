@@ -102,10 +102,10 @@ class Surfaces:
         irradiance: FloatImage = (color - self.emission) / self.albedo
         return irradiance
 
-    def color(self, irradiance: FloatImage) -> FloatImage:
-        """Return the radiance, never negative, of surfaces under this irradiance and of lights."""
-        color: FloatImage = np.maximum(irradiance, 0) * self.albedo + self.smooth_emission
-        return color
+    def reflected(self, irradiance: FloatImage) -> FloatImage:
+        """Return the radiance, never negative, of surfaces under this irradiance, without what is emitted."""
+        reflected: FloatImage = np.maximum(irradiance, 0) * self.albedo
+        return reflected
 
     def without_features(self) -> Surfaces:
         """Return nothing but the size of the image, for pilots that see the colour alone as irradiance."""
@@ -327,8 +327,10 @@ def divisor(albedo: FloatImage) -> FloatImage:
     return np.where(black, np.float32(1), albedo + np.float32(_ALBEDO_OFFSET))
 
 
-def along_edges(image: FloatImage, edges: FloatImage, sigma: float, threads: int) -> FloatImage:
-    """Return the mean along edges (a structure tensor), with this standard deviation in pixels."""
+def along_edges(
+    image: FloatImage, edges: FloatImage, sigma: float, threads: int, *, across: float = _ACROSS_EDGES
+) -> FloatImage:
+    """Return the mean along edges (a structure tensor), with these standard deviations in pixels."""
     return _core.smooth_along_edges(
-        np.ascontiguousarray(image), edges, along=sigma, across=_ACROSS_EDGES, threads=threads
+        np.ascontiguousarray(image), edges, along=sigma, across=across, threads=threads
     )
