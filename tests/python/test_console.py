@@ -143,6 +143,24 @@ def test_control_characters_do_not_reach_the_terminal_by_the_progress(terminal, 
     assert "\x1b]" not in told  # a bar moves the cursor by other sequences
 
 
+def test_a_slow_start_does_not_count_for_the_time_left(monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
+    with progress_on_stderr("rendering") as progress:
+        for seconds, fraction in ((10.0, 0.0), (20.0, 0.01), (25.0, 0.02), (29.0, 0.05), (30.0, 0.11)):
+            now = seconds
+            progress(fraction, "")
+    lines = [
+        "rendering: 0%",
+        "rendering: 1%",
+        "rendering: 2%",
+        "rendering: 11%, 01:29 left",  # a tenth in the last 10 s
+        "rendering: done in 00:30",
+    ]
+    assert capsys.readouterr().err.splitlines() == lines
+
+
 @pytest.mark.parametrize("buffered", [True, False])
 @pytest.mark.parametrize(
     ("name", "options"),

@@ -51,6 +51,9 @@ _NUMBER_AND_UNIT = r"(\d+(?:\.\d*)?|\.\d+)(ms|[smhd]|$)"
 LINE_INTERVAL_S = 5.0
 """How often progress is reported where there is no terminal to draw a bar on."""
 
+_LEAST_DONE = 0.02
+"""The part of the work whose speed foretells the rest."""
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line and whose options are never abbreviated."""
@@ -154,7 +157,11 @@ def _discard_stdout() -> None:
 
 @contextmanager
 def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
-    """Yield a progress callback: a bar with the time left, or a line now and then off a terminal."""
+    """Yield a progress callback: a bar with the time left, or a line now and then off a terminal.
+
+    The line tells the time left by the speed since the first progress: what comes before it, such as reading
+    meshes, happens once.
+    """
     if sys.stderr.isatty():
         with tqdm(
             total=1.0,
@@ -170,14 +177,19 @@ def progress_on_stderr(what: str) -> Iterator[Callable[[float, str], None]]:
         return
 
     start = last = time.monotonic()
+    first: tuple[float, float] | None = None
 
     def tell(fraction: float, message: str) -> None:
-        nonlocal last
+        nonlocal last, first
         now = time.monotonic()
+        if first is None and fraction > 0:
+            first = now, fraction
         if now - last < LINE_INTERVAL_S:
             return
         last = now
-        left = f", {tqdm.format_interval((now - start) * (1 / fraction - 1))} left" if fraction > 0 else ""
+        left = ""
+        if first is not None and (done := fraction - first[1]) >= _LEAST_DONE:
+            left = f", {tqdm.format_interval((now - first[0]) * (1 - fraction) / done)} left"
         _tell(f"{what}: {fraction:.0%}{left}{', ' + message if message else ''}")
 
     yield tell
