@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,9 @@ OPTIONAL = (
 
 
 def pytest_configure() -> None:
-    """Refuse to skip on a machine that is there to test everything."""
+    """Refuse to skip on a machine that is there to test everything; let tests send Ctrl-C."""
+    # What a script starts in the background ignores it, and so does what that starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     missing = [name for name in OPTIONAL if find_spec(name) is None]
     if missing and os.environ.get("CI"):
         raise pytest.UsageError(f"CI is set, and {', '.join(missing)} is not installed")
