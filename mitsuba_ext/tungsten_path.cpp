@@ -54,6 +54,7 @@
 
 #include "core.hpp"
 #include "tungsten_lens.hpp"
+#include "tungsten_lights.hpp"
 #include "tungsten_plugin.hpp"
 
 namespace mitsuba {
@@ -312,6 +313,7 @@ class TungstenPath final : public Variant::Integrator {
                     bool /*evaluate*/) override {
         m_render_timer.reset();
         sees_through_ = has_transparency(*scene);
+        lights_.prepare(*scene);
         surrounded_by_several_ =
             scene->environment() != nullptr && scene->environment()->class_name() == "Environments";
         const auto size = sensor->film()->crop_size();
@@ -438,7 +440,7 @@ class TungstenPath final : public Variant::Integrator {
         const Variant::PhaseFunctionContext context(nullptr);
         const auto* phase = path.medium->phase_function();
         if (path.samples_lights && path.bounce < max_bounces_ - 1) {
-            const LightSample light = sample_light(scene, hit, random);
+            const LightSample light = sample_light(hit, random);
             const auto [value, pdf] = phase->eval_pdf(context, hit, light.direction.d);
             light_from(scene, hit, light, value, pdf, path.medium, path);
         }
@@ -532,7 +534,8 @@ class TungstenPath final : public Variant::Integrator {
         const Rgb emission = all_light ? Rgb(emitter.eval_direction(path.vertex, towards)) : seen;
         if (is_black(emission)) return emission;
         return emission *
-               power_heuristic(path.direction_pdf, scene.pdf_emitter_direction(path.vertex, towards));
+               power_heuristic(path.direction_pdf, lights_.probability(path.vertex.p, emitter) *
+                                                       emitter.pdf_direction(path.vertex, towards, true));
     }
 
     static Scattering scatter(const Variant::BSDF& bsdf, const SurfaceHit& hit, Random& random) {
@@ -591,9 +594,13 @@ class TungstenPath final : public Variant::Integrator {
     };
 
     template <typename Hit>
-    static LightSample sample_light(const Scene& scene, const Hit& from, Random& random) {
-        const auto [direction, weight] = scene.sample_emitter_direction(from, random.next_2d(), false);
-        return {.direction = direction, .weight = weight};
+    LightSample sample_light(const Hit& from, Random& random) const {
+        const auto [emitter, probability] = lights_.choose(from.p, random.next());
+        if (emitter == nullptr)
+            return {.direction = dr::zeros<Variant::DirectionSample3f>(), .weight = Rgb(0.f)};
+        auto [direction, weight] = emitter->sample_direction(from, random.next_2d(), true);
+        direction.pdf *= probability;
+        return {.direction = direction, .weight = weight / probability};
     }
 
     // Adds the light that `from`, of this value and pdf, passes on from a sampled emitter through a medium.
@@ -614,7 +621,7 @@ class TungstenPath final : public Variant::Integrator {
     std::optional<float> light_from_surface(const Scene& scene, const Variant::BSDF& bsdf, Random& random,
                                             Path& path) const {
         const SurfaceHit& hit = path.hit;
-        const LightSample light = sample_light(scene, hit, random);
+        const LightSample light = sample_light(hit, random);
         const Vector3 local = hit.to_local(light.direction.d);
         if (!is_consistent(bsdf, hit, light.direction.d)) return {};
         const auto [value, pdf] = bsdf.eval_pdf(BSDFContext(), hit, local);
@@ -660,6 +667,7 @@ class TungstenPath final : public Variant::Integrator {
     FilterTable filter_;
     float pixel_center_;
     TungstenLens lens_;
+    LightChooser lights_;
     uint32_t threads_;
     std::vector<Quantity> quantities_;
     std::map<std::string, ref<Texture>, std::less<>> albedos_;

@@ -354,7 +354,7 @@ def agree(ours: Buffer, theirs: Buffer, what: str) -> None:
 
     Over the pixels, its root mean square in standard deviations is about 1 (less where half floats round more
     than samples scatter), its mean is 0 within 5 standard deviations, and silhouettes apart no pixel stands
-    out. The variances agree in the median; those of colour roughly, as lights are chosen differently.
+    out. The variances agree in the median; those of colour roughly, as lights are chosen otherwise.
     """
     assert ours.variance is not None
     assert theirs.variance is not None

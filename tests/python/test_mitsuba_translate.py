@@ -338,6 +338,34 @@ def test_irradiance(folder: Path, light: Json, irradiance_over_pi: float) -> Non
     np.testing.assert_allclose(buffers.color.mean.mean(), expected, rtol=0.02, atol=1e-7)
 
 
+def lamps_of_all_kinds(at: float, scale: float) -> list[Json]:
+    """Lamps that rays find, around the y axis and as far above the floor."""
+    kinds = ("quad", "sphere", "cube", "disk", "mesh", "mesh")
+    turns = np.linspace(0, 2 * math.pi, len(kinds), endpoint=False)
+    return [
+        {
+            **({"type": "mesh", "file": "roof.obj"} if kind == "mesh" else {"type": kind}),
+            "bsdf": {"type": "null"},
+            "emission": 1.0 + 0.2 * number,
+            "transform": {
+                "position": [at * math.sin(turn), at, at * math.cos(turn)],
+                "scale": scale,
+                "rotation": [0, 30 * number, 160],
+            },
+        }
+        for number, (kind, turn) in enumerate(zip(kinds, turns, strict=True))
+    ]
+
+
+def test_lamps_that_bring_little_light_bring_little_noise(folder: Path) -> None:
+    """Each is sampled about as often as its light counts. Sampled alike, they had 2500 times the variance."""
+    (folder / "roof.obj").write_text(ROOF)
+    far = [*lamps_of_all_kinds(at=40, scale=1), {"type": "point", "transform": {"position": [0, 40, 9]}}]
+    far[-1]["emission"] = 1
+    color = render(folder, [FLOOR, LAMP, *far], DOWN, spp=256).color
+    assert 256 * color.variance.mean() < 0.1 * color.mean.mean() ** 2
+
+
 def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -> None:
     sun = {"type": "infinite_sphere_cap", "cap_angle": 5, "emission": 40}
     other = {**sun, "cap_angle": 20, "emission": 3, "transform": {"rotation": [0, 0, 30]}}
@@ -357,7 +385,9 @@ def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -
         np.testing.assert_allclose(render(folder, [mirror, *lights], down).color.mean, seen, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["bitmap", "skydome", "cap", "together", "ball", "smooth mesh"])
+@pytest.mark.parametrize(
+    "kind", ["bitmap", "skydome", "cap", "together", "ball", "smooth mesh", "several lamps"]
+)
 def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
     """What paths find by themselves and what they are shown must be the same light."""
     pixels = np.full((8, 16, 3), 0.1, np.float32)
@@ -377,6 +407,7 @@ def test_light_samples_change_no_mean(folder: Path, kind: str) -> None:
         "together": [bitmap, WHITE_SKY],
         "ball": [{**ball(GREY), "emission": 3.0}],
         "smooth mesh": [{"type": "mesh", "file": "roof.obj", "smooth": True, "bsdf": GREY, "emission": 3.0}],
+        "several lamps": [*lamps_of_all_kinds(at=1.5, scale=0.5), cap],
     }
     (folder / "roof.obj").write_text(ROOF)
     means = []

@@ -1,4 +1,7 @@
-"""Tungsten's lights that no ray can hit: points, and what surrounds the scene."""
+"""Tungsten's lights that no ray can hit: points, and what surrounds the scene.
+
+Their ``sampling_weight`` is what mitsuba_ext/tungsten_lights.hpp expects.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, constant, transform
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
-from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, shines, texture_node
+from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, light_of, mean_value, shines, texture_node
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.types import Matrix
 
@@ -31,10 +34,12 @@ def point_node(builder: SceneBuilder, primitive: ts.Point) -> Node | None:
     if not isinstance(texture, ts.ConstantTexture):
         raise builder.unsupported(f"a point light with a texture of type {texture.kind}")
     scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
+    intensity = _scaled(texture.value, scale)
     return {
         "type": "point",
         "position": [float(x) for x in primitive.world_from_local[:3, 3]],
-        "intensity": constant(_scaled(texture.value, scale)),
+        "intensity": constant(intensity),
+        "sampling_weight": max(intensity),
     }
 
 
@@ -53,7 +58,7 @@ def environment_node(builder: SceneBuilder, primitive: Surrounding) -> Node | No
         return _cap(builder, primitive, texture)
     scale = 1.0 / (4.0 * math.pi) if primitive.power is not None else 1.0
     if isinstance(texture, ts.ConstantTexture):
-        return {"type": "constant", "radiance": constant(_scaled(texture.value, scale))}
+        return _constant_environment(_scaled(texture.value, scale))
     if isinstance(texture, ts.BitmapTexture) and texture.interpolate:
         pixels = bitmap_pixels(builder, texture, "rgb") * (scale * texture.scale)
         return envmap_node(pixels, _rotation(builder, primitive.world_from_local), clamp=texture.clamp)
@@ -64,14 +69,15 @@ def environment_node(builder: SceneBuilder, primitive: Surrounding) -> Node | No
 
 def default_environment() -> Node:
     """Return the white sky that Tungsten adds to a scene without lights."""
-    return {"type": "constant", "radiance": constant((1.0, 1.0, 1.0))}
+    return _constant_environment((1.0, 1.0, 1.0))
 
 
 def together(surroundings: Sequence[tuple[Any, Surrounding]]) -> Any:
     """Return one emitter for all lights around the scene, since Mitsuba supports only one."""
     if len(surroundings) == 1:
         return surroundings[0][0]
-    node: Node = {"type": "tungsten_environments"}
+    weight = sum(light.sampling_weight() for light, _ in surroundings)
+    node: Node = {"type": "tungsten_environments", "sampling_weight": weight}
     for number, (light, primitive) in enumerate(surroundings):
         node |= {
             f"light_{number}": light,
@@ -100,6 +106,35 @@ def envmap_node(
         "type": "envmap",
         "bitmap": mi.Bitmap(np.ascontiguousarray(rows, dtype=np.float32)),
         "to_world": transform(to_world),
+        "sampling_weight": _irradiance(pixels),
+    }
+
+
+def _irradiance(pixels: npt.NDArray[np.floating[Any]]) -> float:
+    """Return about the irradiance of a surface that faces the bright side of what surrounds it.
+
+    ``pixels`` are those of `envmap_node`. A quarter of the light from all directions and half of its vector
+    sum are the cosine's first two terms (Ramamoorthi and Hanrahan, "An Efficient Representation for
+    Irradiance Environment Maps", SIGGRAPH 2001); both are exact for a sky of one colour.
+    """
+    rows, columns = pixels.shape[:2]
+    polar = (np.arange(rows) + 0.5) * math.pi / rows
+    azimuth = (np.arange(columns) + 0.5) * 2.0 * math.pi / columns
+    weights = np.sin(polar) * (math.pi / rows) * (2.0 * math.pi / columns)
+    light = weights[:, None, None] * light_of(pixels)
+    vector = [
+        np.einsum("rck,r->k", light, np.cos(polar)),
+        np.einsum("rck,r,c->k", light, np.sin(polar), np.cos(azimuth)),
+        np.einsum("rck,r,c->k", light, np.sin(polar), np.sin(azimuth)),
+    ]
+    return float((0.25 * light.sum(axis=(0, 1)) + 0.5 * np.linalg.norm(vector, axis=0)).max())
+
+
+def _constant_environment(radiance: ts.Vec3) -> Node:
+    return {
+        "type": "constant",
+        "radiance": constant(radiance),
+        "sampling_weight": math.pi * max(radiance),
     }
 
 
@@ -107,6 +142,7 @@ def _cap(builder: SceneBuilder, primitive: ts.InfiniteSphereCap, texture: ts.Tex
     if primitive.cap_angle == 0.0:
         return None
     angle = math.radians(primitive.cap_angle)
+    shown = math.pi * math.sin(min(angle, 0.5 * math.pi)) ** 2  # to a surface that faces it
     solid_angle = 4.0 * math.pi * math.sin(angle / 2.0) ** 2
     scale = 1.0 / solid_angle if primitive.power is not None else 1.0
     # Tungsten takes the one colour at UV (0, 0), where its blade textures have theirs, whatever they cover.
@@ -117,6 +153,7 @@ def _cap(builder: SceneBuilder, primitive: ts.InfiniteSphereCap, texture: ts.Tex
         "direction": [float(x) for x in primitive.world_from_local[:3, 1]],
         "cap_angle": angle,
         "radiance": texture_node(builder, texture, "rgb", scale=scale),
+        "sampling_weight": shown * scale * mean_value(builder, texture),
     }
 
 

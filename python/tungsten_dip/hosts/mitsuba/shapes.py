@@ -20,7 +20,7 @@ from tungsten_dip.hosts.mitsuba.bsdfs import BentShape, bsdf_object, height_map
 from tungsten_dip.hosts.mitsuba.curves import curve_shapes
 from tungsten_dip.hosts.mitsuba.media import medium_object
 from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, transform
-from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, shines, texture_node
+from tungsten_dip.hosts.mitsuba.textures import UV, is_constant, mean_value, shines, texture_node
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.meshes import mesh_geometry
 from tungsten_dip.scene.types import Matrix
@@ -80,7 +80,11 @@ def emission_node(builder: SceneBuilder, primitive: ts.Primitive, area: float, u
     if isinstance(primitive, ts.Sphere) and not is_constant(texture):
         raise builder.unsupported("a shining sphere with a texture")
     return {
-        "emitter": {"type": "tungsten_area", "radiance": texture_node(builder, texture, "rgb", uv, scale)}
+        "emitter": {
+            "type": "tungsten_area",
+            "radiance": texture_node(builder, texture, "rgb", uv, scale),
+            "sampling_weight": scale * mean_value(builder, texture),
+        }
     }
 
 

@@ -118,6 +118,25 @@ def largest_value(builder: SceneBuilder, texture: Texture) -> float:
     raise builder.unsupported(f"a texture of type {texture.kind}")
 
 
+def mean_value(builder: SceneBuilder, texture: Texture) -> float:
+    """Return the mean over a texture that `largest_value` knows, of the channel in which it is largest."""
+    if isinstance(texture, ConstantTexture):
+        return max(texture.value)
+    if isinstance(texture, DiskTexture | BladeTexture):
+        return float(coverage(texture, _SHAPE_RESOLUTION).mean()) * max(texture.value)
+    if isinstance(texture, CheckerTexture):
+        return max(0.5 * (on + off) for on, off in zip(texture.on_color, texture.off_color, strict=True))
+    if isinstance(texture, BitmapTexture):
+        light = light_of(bitmap_pixels(builder, texture, "rgb"))
+        return float(light.mean(axis=(0, 1)).max()) * texture.scale
+    raise builder.unsupported(f"a texture of type {texture.kind}")
+
+
+def light_of(texels: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    """Return texels as radiances of a light: 0 where they are negative or not finite."""
+    return np.where(np.isfinite(texels), np.maximum(texels, 0.0), 0.0).astype(np.float64)
+
+
 def shines(builder: SceneBuilder, primitive: Primitive) -> bool:
     """Whether a primitive is a light that brings any."""
     if isinstance(primitive, Skydome):
