@@ -153,9 +153,14 @@ class LightChooser {
         if (lights_.size() < 2) return shares.values;
         float sum = 0.f;
         for (size_t i = 0; i < lights_.size(); ++i) sum += shares.values[i] = lights_[i].irradiance(at);
-        for (float& share : shares.values) share /= sum;
+        const float alike = shared_alike / static_cast<float>(lights_.size());
+        for (float& share : shares.values) share = (1.f - shared_alike) * share / sum + alike;
         return shares.values;
     }
+
+    // The part of the samples that all lights get alike: where the others are hidden, a faint one is all
+    // there is.
+    static constexpr float shared_alike = 0.1f;
 
     uint64_t preparation_ = 0;  // tells what one thread remembers of this scene from what it does of others
     std::vector<Light> lights_;
