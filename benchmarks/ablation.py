@@ -21,7 +21,7 @@ from tungsten_dip.errors import InputError
 from tungsten_dip.fit import FitSettings, denoise, evidence
 from tungsten_dip.fit.layout import Pilot
 from tungsten_dip.fit.output import all_samples
-from tungsten_dip.fit.pilots import surfaces
+from tungsten_dip.fit.pilots import maker, surfaces
 from tungsten_dip.fit.presets import RECIPES
 from tungsten_dip.report.metrics import compare
 
@@ -54,6 +54,7 @@ VARIANTS: dict[str, Change] = {
     "one pilot and the noisy image": _recipe(pilots=(Pilot("guided", 10, step=2, k=1.0),)),
     "no guided pilots": _without(lambda pilot: pilot.k is not None),
     "only guided pilots": _without(lambda pilot: pilot.kind == "features"),
+    "guided pilots not averaged along edges": lambda: mock.patch.object(maker, "_GUIDED_SIGMA", 0.01),
     "no regression on the position": _without(lambda pilot: pilot.with_position),
     "no mean along edges as a pilot": _without(lambda pilot: pilot.kind == "edges"),
     "no pilot that sees only the colour": _without(lambda pilot: pilot.kind == "color"),
