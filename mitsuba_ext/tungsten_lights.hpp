@@ -2,7 +2,7 @@
 // irradiance there of a surface that faces it with nothing in the way. Tungsten does much the same for most
 // kinds of lights.
 //
-// The `sampling_weight` of an emitter must be its mean radiance; of a point light its intensity; of what
+// The `sampling_weight` of an emitter must be about its mean radiance; of a point light its intensity; of what
 // surrounds the scene that irradiance itself.
 #pragma once
 
@@ -152,9 +152,16 @@ class LightChooser {
         shares.values.assign(lights_.size(), 1.f);
         if (lights_.size() < 2) return shares.values;
         float sum = 0.f;
-        for (size_t i = 0; i < lights_.size(); ++i) sum += shares.values[i] = lights_[i].irradiance(at);
-        const float alike = shared_alike / static_cast<float>(lights_.size());
-        for (float& share : shares.values) share = (1.f - shared_alike) * share / sum + alike;
+        for (size_t i = 0; i < lights_.size(); ++i) {
+            const float irradiance = lights_[i].irradiance(at);
+            // A flattened lamp has no normals.
+            shares.values[i] = std::isfinite(irradiance) ? irradiance : 0.f;
+            sum += shares.values[i];
+        }
+        const float alike = 1.f / static_cast<float>(lights_.size());
+        const bool is_known = sum > 0.f && std::isfinite(sum);
+        for (float& share : shares.values)
+            share = shared_alike * alike + (1.f - shared_alike) * (is_known ? share / sum : alike);
         return shares.values;
     }
 

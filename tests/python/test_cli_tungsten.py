@@ -236,6 +236,23 @@ def test_scenes_that_share_one_file_alone_are_refused(shared, renderer, tmp_path
     assert len(renders) == 1
 
 
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])
+def test_a_scene_that_would_write_over_what_another_reads_is_refused(names, tmp_path, renders, capfd):
+    texture = np.full((4, 4, 3), 0.5, np.float32)
+    write_image(tmp_path / "wood.png", texture)
+    bsdf = {"name": "grey", "type": "lambert", "albedo": "wood.png"}
+    rest = {"hdr_output_file": "", "output_buffers": []}
+    a = write_scene(tmp_path / "a.json", output_file="wood.png", **rest)
+    b = write_scene(tmp_path / "b.json", output_file="b.png", **rest)
+    b.write_text(json.dumps({**json.loads(b.read_text()), "bsdfs": [bsdf]}))
+    before = (tmp_path / "wood.png").read_bytes()
+    scenes = {"a": str(a), "b": str(b)}
+    assert tungsten.main([scenes[name] for name in names]) == 2
+    assert (tmp_path / "wood.png").read_bytes() == before
+    assert (tmp_path / "b.png").exists()
+    assert "wood.png" in capfd.readouterr().err
+
+
 def test_a_scene_whose_buffers_would_write_over_a_picture_is_refused(tmp_path, renders, capfd):
     buffers = [{"type": "normal", "hdr_output_file": "one_denoised.exr"}]
     one = write_scene(tmp_path / "a.json", output_file="one.png", hdr_output_file="", output_buffers=[])
@@ -367,21 +384,31 @@ def test_a_bad_scene_does_not_keep_the_others_from_being_rendered(scene, tmp_pat
     assert err.splitlines()[-1] == "tungsten: 1 of 2 scenes failed, see above"
 
 
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (InputError("a.json: cannot be rendered"), "a.json: cannot be rendered"),
+        (
+            MemoryError("std::bad_alloc"),
+            "not enough memory (std::bad_alloc); free some, or use a smaller image",
+        ),
+    ],
+)
 def test_a_render_that_fails_does_not_keep_the_next_one_from_being_denoised(
-    tmp_path, renders, capfd, monkeypatch
+    error, line, tmp_path, renders, capfd, monkeypatch
 ):
     render = tungsten.render_with_mitsuba
 
     def failing_at_first(scene, **options):
         if scene.path.name == "a.json":
-            raise InputError(f"{scene.path}: cannot be rendered")
+            raise error
         return render(scene, **options)
 
     monkeypatch.setattr("tungsten_dip.cli.tungsten.render_with_mitsuba", failing_at_first)
     scenes = write_frames(tmp_path, "a", "b")
     assert tungsten.main(["--dip-denoise", "--dip-preset", "draft", *map(str, scenes)]) == 2
     lines = capfd.readouterr().err.splitlines()
-    assert f"tungsten: {scenes[0]}: cannot be rendered" in lines
+    assert f"tungsten: {line}" in lines
     assert lines[-1] == "tungsten: 1 of 2 scenes failed, see above"
     assert {path.name for path in tmp_path.glob("*.exr")} == {"b.exr", "b_denoised.exr"}
 

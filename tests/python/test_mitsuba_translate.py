@@ -366,6 +366,54 @@ def test_lamps_that_bring_little_light_bring_little_noise(folder: Path) -> None:
     assert 256 * color.variance.mean() < 0.2 * color.mean.mean() ** 2
 
 
+@pytest.mark.parametrize("height", [0.0, 1e-3])
+def test_a_flattened_lamp_keeps_no_light_from_being_sampled(folder: Path, height: float) -> None:
+    flat = {"type": "cylinder", "capped": True, "emission": 1e-3, "bsdf": {"type": "null"}}
+    flat["transform"] = {"position": [0, 3, 0], "scale": [0.5, height, 0.5]}
+    lit, lit_alone = (render(folder, [FLOOR, WHITE_SKY, *lamps], DOWN, spp=64) for lamps in ([flat], []))
+    np.testing.assert_allclose(lit.color.mean.mean(), lit_alone.color.mean.mean(), rtol=0.05)
+
+
+def test_texels_that_are_not_finite_are_dark_and_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pixels = np.full((8, 16, 3), 0.5, np.float32)
+    pixels[2, 3, 1] = np.nan
+    pixels[4, 5, 0] = np.inf
+    write_image(folder / "map.pfm", pixels)
+    sky = {"type": "infinite_sphere", "emission": "map.pfm"}
+    lit = render(folder, [FLOOR, sky], DOWN, spp=64).color.mean
+    np.testing.assert_allclose(lit.mean(axis=(0, 1)), 0.25, rtol=0.05)
+    assert f"{folder / 'map.pfm'}: 2 values are not finite, and taken for 0" in caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("R", "G", "B", "Z"), (0.1, 0.2, 0.3)),
+        (("R", "G"), (0.1, 0.2, 0.0)),
+        (("BY", "RY", "Y"), (0.3, 0.3, 0.3)),
+        (("depth", "height", "Z"), None),
+    ],
+)
+def test_an_exr_texture_has_the_channels_of_its_names(
+    folder: Path, names: tuple[str, ...], expected: tuple[float, ...] | None
+) -> None:
+    spec = OpenImageIO.ImageSpec(8, 4, len(names), "float")
+    spec.channelnames = names
+    image = OpenImageIO.ImageOutput.create("map.exr")
+    assert image.open(str(folder / "map.exr"), spec)
+    values = dict(zip(names, (0.1, 0.2, 0.3, 9.0), strict=False))
+    texel = np.array([values[name] for name in names], np.float32)
+    assert image.write_image(np.ascontiguousarray(np.broadcast_to(texel, (4, 8, len(names)))))
+    image.close()
+    sky = {"type": "infinite_sphere", "emission": "map.exr"}
+    if expected is None:
+        with pytest.raises(InputError, match=r"map\.exr: expected a texture with channels R, G, B or Y, got"):
+            render(folder, [FLOOR, sky], DOWN)
+        return
+    up = {"transform": {"position": [0, 1, 0], "look_at": [0, 2, 0], "up": [0, 0, 1]}, "fov": 4}
+    np.testing.assert_allclose(render(folder, [sky], up).color.mean.mean(axis=(0, 1)), expected, rtol=1e-3)
+
+
 def test_all_lights_around_a_scene_light_it_and_the_last_is_seen(folder: Path) -> None:
     sun = {"type": "infinite_sphere_cap", "cap_angle": 5, "emission": 40}
     other = {**sun, "cap_angle": 20, "emission": 3, "transform": {"rotation": [0, 0, 30]}}

@@ -399,6 +399,23 @@ def test_the_first_network_is_saved_and_used(frames, capfd):
     assert (frame["how"], frame["iterations"]) == ("followed", 0)
 
 
+def test_the_first_network_is_saved_before_the_next_frame(frames, monkeypatch):
+    denoise = work._denoise
+
+    def interrupted_at_the_second(frame, *rest):
+        if frame.number == 1:
+            raise KeyboardInterrupt
+        return denoise(frame, *rest)
+
+    monkeypatch.setattr(work, "_denoise", interrupted_at_the_second)
+    assert main(arguments("--save-model", "m.onnx")) == 130
+    saved = Path("m.onnx").read_bytes()
+    monkeypatch.undo()
+    monkeypatch.chdir(frames)
+    assert main(arguments("--save-model", "m.onnx")) == 0
+    assert Path("m.onnx").read_bytes() == saved
+
+
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")])
 @pytest.mark.parametrize("cameras", [True, False])
 def test_the_saved_network_is_the_first_frames_whatever_comes_after(frames, capfd, cameras, workers):

@@ -84,22 +84,28 @@ def run(command: str, body: Callable[[], None]) -> int:
     except BrokenPipeError:
         _discard_stdout()  # whose reader has had enough
         return EXIT_INTERNAL
-    except (InputError, OSError) as error:
-        if debug:
-            raise
-        return _fail(command, _message(error), EXIT_INPUT)
     except Exception as error:
         if debug:
             raise
-        if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
-            return _fail(command, requirement(error.name, "this"), EXIT_INPUT)
-        if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
-            reason = str(error)[:200] or "none left"
-            line = f"not enough memory ({reason}); free some, or use a smaller image"
-            return _fail(command, line, EXIT_INPUT)
-        line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
-        return _fail(command, line, EXIT_INTERNAL)
+        return _fail(command, *line_and_status(error))
     return 0
+
+
+def line_and_status(error: Exception) -> tuple[str, int]:
+    """Return what is told of an error, in one line, and the exit status of a command that it ends."""
+    if isinstance(error, OSError) and error.filename is not None:
+        line, status = f"{error.filename}: {error.strerror}; check the path and its permissions", EXIT_INPUT
+    elif isinstance(error, (InputError, OSError)):
+        line, status = str(error), EXIT_INPUT
+    elif isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
+        line, status = requirement(error.name, "this"), EXIT_INPUT
+    elif isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
+        reason = str(error)[:200] or "none left"
+        line, status = f"not enough memory ({reason}); free some, or use a smaller image", EXIT_INPUT
+    else:
+        line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
+        status = EXIT_INTERNAL
+    return " ".join(line.split()), status
 
 
 @contextmanager
@@ -261,14 +267,8 @@ def _log_on_stderr(command: str, level: int) -> Iterator[None]:
         yield
 
 
-def _message(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}; check the path and its permissions"
-    return str(error)
-
-
 def _fail(command: str, message: str, status: int) -> int:
-    _tell(f"{command}: {' '.join(message.split())}")
+    _tell(f"{command}: {message}")
     return status
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from tungsten_dip.sequence.following import Models
     from tungsten_dip.sequence.frames import Frame
-    from tungsten_dip.sequence.work import Record, Run
+    from tungsten_dip.sequence.work import OnRecord, Record, Run
 
 _LOG = logging.getLogger(__name__)
 
@@ -78,15 +78,20 @@ _REFIT_HELP = (
 
 def _sequence(options: argparse.Namespace) -> Outcome:
     frames, run, models = _arguments(options)
-    records, models = _denoised(options, frames, run, models)
+    errors: list[str] = []
+
+    def on_record(record: Record, found: Models) -> None:
+        _tell(record)
+        if options.save_model is not None and record.number == frames[0].number:
+            # Before any other frame: a run that is interrupted leaves it, and one that resumes has another.
+            try:
+                _save_model(options.save_model, found, record)
+            except InputError as error:
+                errors.append(str(error))
+
+    records = _denoised(options, frames, run, models, on_record)
     if options.report is not None:
         _write_report(options.report, options.input, records)
-    errors = []
-    if options.save_model is not None:
-        try:
-            _save_model(options.save_model, models, records[0])
-        except InputError as error:
-            errors.append(str(error))
     return _summary(records, errors)
 
 
@@ -135,9 +140,9 @@ def _arguments(options: argparse.Namespace) -> tuple[list[Frame], Run, Models]:
 
 
 def _denoised(
-    options: argparse.Namespace, frames: list[Frame], run: Run, models: Models
-) -> tuple[list[Record], Models]:
-    """Denoise the frames, here or on workers; return their records and the networks in the end."""
+    options: argparse.Namespace, frames: list[Frame], run: Run, models: Models, on_record: OnRecord
+) -> list[Record]:
+    """Denoise the frames, here or on workers; return their records."""
     with deferred_interrupts():
         from tungsten_dip.sequence.cluster import denoise_on_cluster
         from tungsten_dip.sequence.work import denoise_frames
@@ -145,8 +150,8 @@ def _denoised(
     workers = options.workers or 1
     with _without_repetition(), progress_on_stderr("denoising") as progress:
         if options.scheduler == "local" and workers == 1:
-            return denoise_frames(frames, run, models, progress, _tell)
-        return denoise_on_cluster(frames, run, options.scheduler, workers, models, progress, _tell)
+            return denoise_frames(frames, run, models, progress, on_record)[0]
+        return denoise_on_cluster(frames, run, options.scheduler, workers, models, progress, on_record)
 
 
 def _summary(records: list[Record], errors: list[str]) -> Outcome:

@@ -14,7 +14,7 @@ from typing import Literal, NoReturn, TypeVar
 from tungsten_dip.buffers.atomic import check_writable, write_text
 from tungsten_dip.buffers.image_file import write_image
 from tungsten_dip.buffers.render_buffers import CHANNELS, RenderBuffers
-from tungsten_dip.cli.console import minutes, progress_on_stderr, run
+from tungsten_dip.cli.console import line_and_status, minutes, progress_on_stderr, run
 from tungsten_dip.cli.denoising import (
     FIT_OPTIONS,
     check_outputs_are_not_inputs,
@@ -140,33 +140,40 @@ def _render_scenes(options: Options, host: str) -> None:
             seeds = [options.seed, *((first + index) % 2**32 for index in range(1, count))]
         else:
             denoise = _each_alone(settings, warm_start)
+
+    def load(path_and_seed: tuple[Path, int | None]) -> tuple[Scene, Options]:
+        path, seed = path_and_seed
+        return load_scene(path, options.input_directory), replace(options, seed=seed)
+
+    # All of them first: most of what is wrong with the last one is told before hours of rendering.
+    loaded = _succeeded(load, zip(options.scenes, seeds, strict=True), count == 1)
+    inputs = {file.resolve() for scene, _ in loaded for file in scene.files}
     taken: set[Path] = set()
 
-    def check(path_and_seed: tuple[Path, int | None]) -> _Job:
-        path, seed = path_and_seed
-        scene = load_scene(path, options.input_directory)
-        return _Job(scene, _checked_outputs(scene, options, taken), replace(options, seed=seed))
+    def check(scene_and_options: tuple[Scene, Options]) -> _Job:
+        scene, its_options = scene_and_options
+        return _Job(scene, _checked_outputs(scene, options, taken, inputs), its_options)
 
-    # All of them first: what is wrong with the last one is not to be told after hours of rendering.
-    jobs = _succeeded(check, zip(options.scenes, seeds, strict=True), count == 1)
+    jobs = _succeeded(check, loaded, count == 1)
     done = _succeeded(lambda job: _render_scene(job, host, settings, denoise), jobs, count == 1)
     if len(done) < count:
         raise InputError(f"{count - len(done)} of {count} scenes failed, see above")
 
 
 def _succeeded(action: Callable[[_T], _R], items: Iterable[_T], alone: bool) -> list[_R]:
-    """Return what becomes of the items but for those that raise InputError, which is logged.
+    """Return what becomes of the items but for those that fail, which is logged.
 
-    Raises it instead if the item is ``alone``.
+    Raises what is wrong instead if the item is ``alone``.
     """
     results = []
     for item in items:
         try:
             results.append(action(item))
-        except InputError as error:
-            if alone:
+        except Exception as error:
+            if alone or isinstance(error, BrokenPipeError):
                 raise
-            _LOG.error("%s", error)
+            _LOG.debug("failed", exc_info=error)
+            _LOG.error("%s", line_and_status(error)[0])
     return results
 
 
@@ -202,11 +209,11 @@ def _render_scene(job: _Job, host: str, settings: FitSettings, denoise: Denoise 
             write_outputs(result, buffers, outputs, tonemap, options.report, remarks, options.save_model)
 
 
-def _checked_outputs(scene: Scene, options: Options, taken: set[Path]) -> SceneOutputs:
+def _checked_outputs(scene: Scene, options: Options, taken: set[Path], inputs: set[Path]) -> SceneOutputs:
     """Return what a scene writes.
 
     ``taken`` are the files of the scenes before, to which this one's are added, with what is made of the
-    render.
+    render; ``inputs`` are what all scenes read.
 
     Raises InputError if a file cannot be written, or would be written over an input or one that is taken.
     """
@@ -230,7 +237,6 @@ def _checked_outputs(scene: Scene, options: Options, taken: set[Path]) -> SceneO
     for file in own:
         check_writable(file, file.suffix)
     rendered, derived = {file.resolve() for file, _ in outputs.files()}, {file.resolve() for file in own}
-    inputs = {file.resolve() for file in scene.files}
     check_outputs_are_not_inputs(sorted(rendered | derived), inputs, folders=(), mapping={})
     both = rendered & derived
     if both:

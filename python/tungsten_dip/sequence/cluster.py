@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from multiprocessing import resource_tracker
@@ -24,7 +24,7 @@ from tungsten_dip.progress import Progress
 from tungsten_dip.remarks import remarks_from_log
 from tungsten_dip.sequence.following import Models, check_can_follow
 from tungsten_dip.sequence.frames import Frame
-from tungsten_dip.sequence.work import Record, Run, denoise_frames, failed, split_finished
+from tungsten_dip.sequence.work import OnRecord, Record, Run, denoise_frames, failed, split_finished
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,13 +60,12 @@ def denoise_on_cluster(
     workers: int,
     models: Models,
     progress: Progress,
-    on_record: Callable[[Record], None],
-) -> tuple[list[Record], Models]:
+    on_record: OnRecord,
+) -> list[Record]:
     """Denoise frames on the workers of a Dask scheduler, or on ``workers`` local processes at most.
 
     Paths mean the same to all workers (a shared file system). Without ``run.settings.threads``, local workers
-    share the cores, and others use one core each. Returns the records of all frames, in their order, and the
-    networks that they shared.
+    share the cores, and others use one core each. Returns the records of all frames, in their order.
 
     Raises InputError if Dask is not installed, the scheduler does not answer or local workers do not start.
     """
@@ -74,7 +73,7 @@ def denoise_on_cluster(
     frames = [_absolute(frame) for frame in frames]
     to_do, records = split_finished(frames, run)
     for record in records:
-        on_record(record)
+        on_record(record, models)
     workers = min(workers, _tasks_at_once(to_do))
     if run.settings.threads is None:
         share = max(1, thread_count(None) // workers) if scheduler == "local" else 1
@@ -88,10 +87,10 @@ def denoise_on_cluster(
                     _LOG.info("%s", remark)
                 for record in done:
                     records.append(record)
-                    on_record(record)
+                    on_record(record, shared)
                     progress(len(records) / len(frames), f"frame {record.number}")
                 raise_if_terminated()
-    return sorted(records, key=lambda record: record.number), shared
+    return sorted(records, key=lambda record: record.number)
 
 
 def _tasks_at_once(frames: list[Frame]) -> int:

@@ -104,18 +104,21 @@ def split_finished(frames: Iterable[Frame], run: Run) -> tuple[list[Frame], list
     return to_do, records
 
 
+OnRecord = Callable[[Record, Models], None]
+
+
 def denoise_frames(
     frames: Iterable[Frame],
     run: Run,
     models: Models = Models(),
     progress: Progress = silent,
-    on_record: Callable[[Record], None] = lambda _: None,
+    on_record: OnRecord = lambda *_: None,
 ) -> tuple[list[Record], Models]:
     """Denoise frames one after another; return their records and the networks in the end.
 
     Frames that are finished are skipped; one that cannot be done, for whatever reason, has an error in its
     record, and the others are done. Ctrl-C ends the run between two frames at the latest; a frame cut short
-    is not saved. ``on_record`` gets every record as soon as it is known.
+    is not saved. ``on_record`` gets every record as soon as it is known, and the networks of then.
     """
     follower = Follower(run.settings, run.refit, models)
     frames = list(frames)
@@ -132,7 +135,7 @@ def denoise_frames(
         if record.error is None and not record.skipped:
             latest = record.number
         records.append(record)
-        on_record(record)
+        on_record(record, follower.models)
     return records, follower.models
 
 

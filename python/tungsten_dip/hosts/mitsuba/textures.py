@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import mitsuba as mi
@@ -125,7 +126,8 @@ def mean_value(builder: SceneBuilder, texture: Texture) -> float:
     if isinstance(texture, DiskTexture | BladeTexture):
         return float(coverage(texture, _SHAPE_RESOLUTION).mean()) * max(texture.value)
     if isinstance(texture, CheckerTexture):
-        return max(0.5 * (on + off) for on, off in zip(texture.on_color, texture.off_color, strict=True))
+        pairs = zip(texture.on_color, texture.off_color, strict=True)
+        return max(0.5 * (max(on, 0.0) + max(off, 0.0)) for on, off in pairs)
     if isinstance(texture, BitmapTexture):
         light = light_of(bitmap_pixels(builder, texture, "rgb"))
         return float(light.mean(axis=(0, 1)).max()) * texture.scale
@@ -133,8 +135,8 @@ def mean_value(builder: SceneBuilder, texture: Texture) -> float:
 
 
 def light_of(texels: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Return texels as radiances of a light: 0 where they are negative or not finite."""
-    return np.where(np.isfinite(texels), np.maximum(texels, 0.0), 0.0).astype(np.float64)
+    """Return texels as radiances of a light: 0 where they are negative."""
+    return np.asarray(np.maximum(texels, 0.0), np.float64)
 
 
 def shines(builder: SceneBuilder, primitive: Primitive) -> bool:
@@ -231,7 +233,11 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     channels = pixels.shape[2]
     alpha: Any = pixels[:, :, alpha_channel : alpha_channel + 1] if alpha_channel >= 0 else None
-    rgb: Any = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
+    rgb: Any
+    if texture.file.suffix.lower() == ".exr":
+        rgb = _rgb_from_exr(texture, pixels, spec.channelnames)
+    else:
+        rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
     texels: Any
     if request == "rgb":
         texels = rgb if hdr else _GAMMA[rgb] if texture.gamma_correct else rgb / np.float32(255)
@@ -243,4 +249,22 @@ def _read_texels(texture: BitmapTexture, request: Request) -> _Texels:
     else:
         mean = rgb.sum(axis=2, keepdims=True, dtype=np.float32) / np.float32(3)
         texels = mean if hdr else np.floor(mean) / np.float32(255)
+    texels = np.asarray(texels, np.float32)
+    if lost := np.count_nonzero(~np.isfinite(texels)):
+        _LOG.warning("%s: %d values are not finite, and taken for 0", texture.file, lost)
+        texels = np.where(np.isfinite(texels), texels, 0)
     return np.asarray(texels, np.float32)
+
+
+def _rgb_from_exr(texture: BitmapTexture, pixels: _Texels, names: Sequence[str]) -> _Texels:
+    """Return the channels that Tungsten takes: R, G and B, black where one is missing, or Y."""
+    if known := [name for name in "RGB" if name in names]:
+        rgb: _Texels = np.zeros((*pixels.shape[:2], 3), np.float32)
+        for name in known:
+            rgb[:, :, "RGB".index(name)] = pixels[:, :, names.index(name)]
+        return rgb
+    if "Y" in names:
+        return np.stack([pixels[:, :, names.index("Y")]] * 3, axis=2)
+    raise InputError(
+        f"{texture.file}: expected a texture with channels R, G, B or Y, got {', '.join(names)}; rename them"
+    )
