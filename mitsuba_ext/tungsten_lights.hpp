@@ -2,8 +2,8 @@
 // irradiance there of a surface that faces it with nothing in the way. Tungsten does much the same for most
 // kinds of lights.
 //
-// The `sampling_weight` of an emitter must be about its mean radiance; of a point light its intensity; of what
-// surrounds the scene that irradiance itself.
+// The `sampling_weight` of an emitter must be about its mean radiance; of a point light its intensity; of
+// what surrounds the scene that irradiance itself.
 #pragma once
 
 #include <drjit/packet.h>
