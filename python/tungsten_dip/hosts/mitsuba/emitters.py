@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from tungsten_dip.hosts.mitsuba.scene_builder import Node, SceneBuilder, constant, transform
 from tungsten_dip.hosts.mitsuba.sky import sky_pixels
-from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, light_of, mean_value, shines, texture_node
+from tungsten_dip.hosts.mitsuba.textures import bitmap_pixels, mean_value, shines, texture_node
 from tungsten_dip.scene import types as ts
 from tungsten_dip.scene.types import Matrix
 
@@ -120,14 +120,15 @@ def _irradiance(pixels: npt.NDArray[np.floating[Any]]) -> float:
     rows, columns = pixels.shape[:2]
     polar = (np.arange(rows) + 0.5) * math.pi / rows
     azimuth = (np.arange(columns) + 0.5) * 2.0 * math.pi / columns
-    weights = np.sin(polar) * (math.pi / rows) * (2.0 * math.pi / columns)
-    light = weights[:, None, None] * light_of(pixels)
+    solid_angles = np.sin(polar) * (math.pi / rows) * (2.0 * math.pi / columns)
+    light = np.maximum(pixels, 0.0)
+    total = np.einsum("rck,r->k", light, solid_angles)
     vector = [
-        np.einsum("rck,r->k", light, np.cos(polar)),
-        np.einsum("rck,r,c->k", light, np.sin(polar), np.cos(azimuth)),
-        np.einsum("rck,r,c->k", light, np.sin(polar), np.sin(azimuth)),
+        np.einsum("rck,r->k", light, solid_angles * np.cos(polar)),
+        np.einsum("rck,r,c->k", light, solid_angles * np.sin(polar), np.cos(azimuth)),
+        np.einsum("rck,r,c->k", light, solid_angles * np.sin(polar), np.sin(azimuth)),
     ]
-    return float((0.25 * light.sum(axis=(0, 1)) + 0.5 * np.linalg.norm(vector, axis=0)).max())
+    return float((0.25 * total + 0.5 * np.linalg.norm(vector, axis=0)).max())
 
 
 def _constant_environment(radiance: ts.Vec3) -> Node:

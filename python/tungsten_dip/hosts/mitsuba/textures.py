@@ -129,14 +129,9 @@ def mean_value(builder: SceneBuilder, texture: Texture) -> float:
         pairs = zip(texture.on_color, texture.off_color, strict=True)
         return max(0.5 * (max(on, 0.0) + max(off, 0.0)) for on, off in pairs)
     if isinstance(texture, BitmapTexture):
-        light = light_of(bitmap_pixels(builder, texture, "rgb"))
-        return float(light.mean(axis=(0, 1)).max()) * texture.scale
+        light = np.maximum(bitmap_pixels(builder, texture, "rgb"), 0.0)
+        return float(light.mean(axis=(0, 1), dtype=np.float64).max()) * texture.scale
     raise builder.unsupported(f"a texture of type {texture.kind}")
-
-
-def light_of(texels: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Return texels as radiances of a light: 0 where they are negative."""
-    return np.asarray(np.maximum(texels, 0.0), np.float64)
 
 
 def shines(builder: SceneBuilder, primitive: Primitive) -> bool:
