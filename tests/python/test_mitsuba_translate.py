@@ -959,6 +959,16 @@ def loaded(folder: Path, primitives: list[Json], **sections: Any) -> Any:
         return mi.load_dict({**translate(load_scene(path)).scene, "integrator": {"type": "path"}})
 
 
+@pytest.mark.parametrize("kind", ["constant", "bitmap", "cap of half the sky"])
+def test_a_sky_weighs_its_irradiance_among_the_lights(folder: Path, kind: str) -> None:
+    write_image(folder / "map.pfm", np.full((32, 64, 3), 2.0, np.float32))
+    sky: Json = {"type": "infinite_sphere", "emission": "map.pfm" if kind == "bitmap" else 2}
+    if kind == "cap of half the sky":
+        sky = {"type": "infinite_sphere_cap", "cap_angle": 90, "emission": 2}
+    (light,) = loaded(folder, [FLOOR, sky]).emitters()
+    assert light.sampling_weight() == pytest.approx(2 * math.pi, rel=1e-3)
+
+
 @pytest.mark.parametrize(("aperture_size", "samples_lens"), [(0.0, False), (0.1, True)])
 def test_the_lens_is_sampled_only_where_it_is_open(
     folder: Path, aperture_size: float, samples_lens: bool
