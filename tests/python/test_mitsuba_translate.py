@@ -366,12 +366,21 @@ def test_lamps_that_bring_little_light_bring_little_noise(folder: Path) -> None:
     assert 256 * color.variance.mean() < 0.2 * color.mean.mean() ** 2
 
 
-@pytest.mark.parametrize("height", [0.0, 1e-3])
-def test_a_flattened_lamp_keeps_no_light_from_being_sampled(folder: Path, height: float) -> None:
-    flat = {"type": "cylinder", "capped": True, "emission": 1e-3, "bsdf": {"type": "null"}}
-    flat["transform"] = {"position": [0, 3, 0], "scale": [0.5, height, 0.5]}
-    lit, lit_alone = (render(folder, [FLOOR, WHITE_SKY, *lamps], DOWN, spp=64) for lamps in ([flat], []))
-    np.testing.assert_allclose(lit.color.mean.mean(), lit_alone.color.mean.mean(), rtol=0.05)
+def test_a_flattened_lamp_keeps_no_light_from_being_sampled(folder: Path) -> None:
+    """Its normals are not finite."""
+    lamp = {
+        "type": "cylinder",
+        "transform": {"position": [0, 0.5, 0], "scale": [1, 0, 1]},
+        "emission": 1e-3,
+        "bsdf": GREY,
+    }
+    integrators = [
+        {"type": "path_tracer", "enable_light_sampling": samples_lights} for samples_lights in (True, False)
+    ]
+    sampled, found = (
+        render(folder, [FLOOR, WHITE_SKY, lamp], spp=256, integrator=integrator) for integrator in integrators
+    )
+    np.testing.assert_allclose(sampled.color.mean.mean(), found.color.mean.mean(), rtol=0.01)
 
 
 def test_texels_that_are_not_finite_are_dark_and_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
