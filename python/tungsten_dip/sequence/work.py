@@ -105,6 +105,7 @@ def split_finished(frames: Iterable[Frame], run: Run) -> tuple[list[Frame], list
 
 
 OnRecord = Callable[[Record, Models], None]
+"""Gets the record of a frame, and the networks that are known by then."""
 
 
 def denoise_frames(
