@@ -21,6 +21,7 @@ from tungsten_dip.buffers.render_buffers import (
     mean_of,
 )
 from tungsten_dip.fit.neighbours import window_pixels
+from tungsten_dip.fit.pilots.texture import with_texture
 
 # Neighbours weigh exp(-sum of penalty times squared difference of features). exp(-1) is reached by normals 34
 # degrees apart, by one channel of the albedo 0.22 apart, and at the median depth by a surface 1.85 times as
@@ -73,6 +74,19 @@ class _Channel:
     def flat(self) -> bool:
         """Whether it is the same in every pixel."""
         return bool(np.ptp(self.image) == 0)
+
+
+@dataclass(frozen=True)
+class _Albedo:
+    """The albedo of one colour's samples, shape (height, width, 3), with emission above 1.
+
+    ``rendered`` is noisy, ``filtered`` pre-filtered, ``textured`` the latter without emission but with the
+    texture that it lost.
+    """
+
+    rendered: FloatImage
+    filtered: FloatImage
+    textured: FloatImage
 
 
 @dataclass(frozen=True)
@@ -136,12 +150,16 @@ def surfaces_of_colors(
     alpha = alpha_as_albedo(buffers)
     if alpha is not None:
         buffers = replace(buffers, albedo=Buffer(np.repeat(alpha, 3, axis=2)))
-    albedos: Sequence[FloatImage | None] = [None] * len(colors)
     if buffers.albedo is not None:
         rendered = _without_stray_emission(buffers.albedo, threads)
-        albedos = bounded = _bounded_albedos(rendered, colors, scale)
+        bounded = _bounded_albedos(rendered, colors, scale)
         buffers = replace(buffers, albedo=_with_planes(rendered, bounded))
     filtered = prefilter_features(buffers, threads)
+    albedos: Sequence[_Albedo | None] = [None] * len(colors)
+    if buffers.albedo is not None and filtered.albedo is not None:
+        textured = with_texture(filtered.albedo, buffers.albedo, threads)
+        of_colors = (images_for(colors, albedo) for albedo in (buffers.albedo, filtered.albedo, textured))
+        albedos = [_Albedo(*images) for images in zip(*of_colors, strict=True)]
     depth_scale = _depth_scale(filtered)
     images = {
         name: images_for(colors, feature) for name in FEATURES if (feature := filtered.get(name)) is not None
@@ -152,8 +170,8 @@ def surfaces_of_colors(
     channels = [_channels(of_color, depth_scale, of_alpha=alpha is not None) for of_color in features]
     flat = [name for name in channels[0] if all(of_color[name].flat for of_color in channels)]
     return tuple(
-        _surfaces(of_color, flat, albedo, filtered_images.get("albedo"), color.shape, scale, threads)
-        for of_color, albedo, filtered_images, color in zip(channels, albedos, features, colors, strict=True)
+        _surfaces(of_color, flat, albedo, color.shape, scale, threads)
+        for of_color, albedo, color in zip(channels, albedos, colors, strict=True)
     )
 
 
@@ -217,16 +235,12 @@ def _depth_scale(filtered: RenderBuffers) -> float:
 def _surfaces(
     channels: dict[str, _Channel],
     flat: Sequence[str],
-    albedo: FloatImage | None,
-    filtered_albedo: FloatImage | None,
+    albedo: _Albedo | None,
     shape: tuple[int, ...],
     scale: float,
     threads: int,
 ) -> Surfaces:
-    """Return the surfaces of one colour of this shape, with the channels that are not ``flat``.
-
-    The albedo is None, before and after pre-filtering, if there is none.
-    """
+    """Return the surfaces of one colour of this shape, with the channels that are not ``flat``."""
     kept = {name: channel for name, channel in channels.items() if name not in flat}
     features = np.empty((*shape[:2], len(kept)), np.float32)
     for index, channel in enumerate(kept.values()):
@@ -235,10 +249,10 @@ def _surfaces(
     edges = _core.structure_tensor(features * np.sqrt(np.array(penalty, np.float32)), threads)
     divided_by = np.ones(shape, np.float32)
     emission = smooth_emission = np.zeros(shape, np.float32)
-    if albedo is not None and filtered_albedo is not None:
-        divided_by = divisor(np.clip(filtered_albedo, 0, 1))
-        emission = np.maximum(albedo - 1, 0) * np.float32(scale)
-        smooth_emission = np.maximum(filtered_albedo - 1, 0) * np.float32(scale)
+    if albedo is not None:
+        divided_by = divisor(albedo.textured)
+        emission = np.maximum(albedo.rendered - 1, 0) * np.float32(scale)
+        smooth_emission = np.maximum(albedo.filtered - 1, 0) * np.float32(scale)
         if emission.any():
             smooth_emission = _smooth_emission(emission, smooth_emission, edges, threads)
     return Surfaces(
