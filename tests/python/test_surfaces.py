@@ -52,6 +52,17 @@ def test_light_that_neither_the_other_half_nor_pixels_around_see_is_stray(pixel:
     assert _surfaces_of_lamps((a, b))[0].emission.max() == pytest.approx(30, rel=1e-5)
 
 
+@pytest.mark.parametrize(("hit", "stray"), [(0.03, True), (0.5, False)])
+def test_light_that_the_halves_see_in_different_pixels_is_stray(hit: float, stray: bool) -> None:
+    """Glass through which some paths hit a lamp by chance, in some pixels with both halves."""
+    rng = np.random.default_rng(0)
+    a, b = 30.0 * (rng.random((2, 40, 50)) < hit)
+    assert ((a > 0) & (b > 0)).any()
+    for surfaces, emitted in zip(_surfaces_of_lamps((a, b)), (a, b), strict=True):
+        kept = (surfaces.emission[emitted > 0] > 0).mean()
+        assert kept < 0.05 if stray else kept > 0.95
+
+
 def test_the_sun_is_not_smeared_over_the_sky() -> None:
     """The sky emits too, a little."""
     sky = np.full((40, 48), 2.0)

@@ -58,6 +58,11 @@ _STRAY_AROUND = 0.6
 """Emission of one half was hit by chance beyond so many times the other half's, or that of all other pixels
 of both halves' 3x3, in which two about as bright thus suffice."""
 
+_SPARSE_RADIUS = 8
+_SPARSE = 0.1
+"""All emission is stray where, of the pixels around in which the halves saw any, both did in less than this
+part."""
+
 
 @dataclass(frozen=True)
 class _Channel:
@@ -287,15 +292,26 @@ def _without_stray_emission(albedo: Buffer, threads: int) -> Buffer:
     """Return an albedo above 1 only where both halves or several pixels around saw about as much emission.
 
     A path that hit a light out of focus, or through glass or a mirror, by chance is noise, and remains in the
-    colour: as emission it would not be denoised.
+    colour: as emission it would not be denoised. Where many paths do, both halves or neighbours see it by
+    chance, too.
     """
     if albedo.halves is None or not (albedo.mean > 1).any():
         return albedo
     emissions = [np.maximum(half - 1, 0) for half in albedo.halves]
     both = emissions[0] + emissions[1]
     around = window_pixels(both.shape, 1) * _core.box_mean(both, 1, threads)
+    seen_a, seen_b = (emission.any(axis=2, keepdims=True) for emission in emissions)
+    pixels = window_pixels(both.shape, _SPARSE_RADIUS)
+    in_both, in_any = (
+        pixels * _core.box_mean(np.asarray(seen, np.float32), _SPARSE_RADIUS, threads)
+        for seen in (seen_a & seen_b, seen_a | seen_b)
+    )
+    # Of five pixels or fewer, that none is seen twice tells nothing.
+    dense = in_both + np.float32(0.5) >= np.float32(_SPARSE) * in_any
     kept_a, kept_b = (
-        np.minimum(half, 1 + np.maximum(_STRAY_OVER_OTHER_HALF * other, _STRAY_AROUND * (around - own)))
+        np.minimum(
+            half, 1 + dense * np.maximum(_STRAY_OVER_OTHER_HALF * other, _STRAY_AROUND * (around - own))
+        )
         for half, own, other in zip(albedo.halves, emissions, emissions[::-1], strict=True)
     )
     taken = mean_of((albedo.halves[0] - kept_a, albedo.halves[1] - kept_b))
