@@ -462,6 +462,12 @@ def test_a_render_by_mitsuba_and_a_fit(tmp_path):
     assert denoised.mean() == pytest.approx(noisy.mean(), rel=0.5)
 
 
+def test_an_output_directory_that_is_a_file_is_refused(tmp_path, scene, capfd):
+    (tmp_path / "out").touch()
+    assert tungsten.main(["--dip-denoise", "-d", str(tmp_path / "out"), str(scene)]) == 2
+    assert f"{tmp_path / 'out'}: expected a folder, found a file" in capfd.readouterr().err
+
+
 def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
     monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
     assert (

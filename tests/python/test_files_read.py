@@ -695,6 +695,13 @@ def test_names_too_long_to_exist_are_refused(read: Any, suffix: str) -> None:
         read("x" * 5000 + suffix)
 
 
+def test_a_scene_that_saves_two_buffers_in_one_file_is_refused(tmp_path: Path) -> None:
+    save(tmp_path / "c.exr", *"RGB")
+    buffers = [{"type": quantity, "hdr_output_file": "c.exr"} for quantity in ("color", "albedo")]
+    (tmp_path / "scene.json").write_text(json.dumps({"renderer": {"output_buffers": buffers}}))
+    refused(tmp_path / "scene.json", r"expected one file for every buffer, got c\.exr twice; rename one")
+
+
 def test_a_scene_may_name_what_cannot_exist(tmp_path: Path) -> None:
     renderer = {"hdr_output_file": "x" * 5000 + ".exr"}
     (tmp_path / "scene.json").write_text(json.dumps({"renderer": renderer}))
@@ -1003,6 +1010,14 @@ def test_pictures_of_few_bits_are_no_radiance(tmp_path: Path, suffix: str) -> No
 def test_pictures_of_other_formats_are_to_be_converted(tmp_path: Path) -> None:
     (tmp_path / "a.tif").touch()
     refused(tmp_path / "a.tif", r"expected linear radiance as \.exr, \.pfm, \.hdr; .* oiiotool IN\.tif -o")
+
+
+@pytest.mark.parametrize("count", [333, 341])
+def test_a_part_of_more_channels_than_an_output_may_have_is_refused(tmp_path: Path, count: int) -> None:
+    """OpenImageIO itself reads 341 layers of three channels, but not what is added to them."""
+    names = [f"layer{index}.{name}" for index in range(count) for name in "RGB"]
+    save(tmp_path / "p.exr", *"RGB", *names)
+    refused(tmp_path / "p.exr", "expected at most 1000 channels in one part, got more; leave out layers")
 
 
 def test_layers_without_end_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

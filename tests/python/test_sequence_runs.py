@@ -230,6 +230,15 @@ def test_missing_and_broken_frames_are_told_and_the_others_done(frames, capsys):
     assert list(outputs(frames)) == ["f0000.exr", "f0003.exr"]
 
 
+def test_an_earlier_result_of_a_frame_that_fails_is_told(frames, capsys):
+    assert main(arguments("--frames", "0-1")) == 0
+    capsys.readouterr()
+    (frames / "noisy/f0001/color.exr").write_bytes(b"no image")
+    assert main(arguments("--frames", "0-1")) == 2
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "frame 1: " in line]
+    assert line.endswith("f0001.exr is an earlier result")
+
+
 @pytest.mark.parametrize("on_cluster", [False, True])
 @pytest.mark.parametrize("error", [RuntimeError("a bug\nin two lines"), MemoryError()])
 def test_a_frame_that_fails_for_whatever_reason_is_told_and_the_others_done(

@@ -156,6 +156,14 @@ def test_a_model_that_does_not_fit_is_refused_with_the_difference_named(
         infer(paper, without)
 
 
+def test_features_that_a_model_does_not_know_are_named(model: Model, frame: SyntheticRender) -> None:
+    note = "the model was fitted without albedo, normal: its network does not use it"
+    few = denoise(frame.buffers.with_quantities(albedo=None, normal=None), DRAFT).model
+    assert few is not None
+    assert note in infer(few, frame.buffers).notes
+    assert not [line for line in infer(model, frame.buffers).notes if "fitted without" in line]
+
+
 WITHOUT_EXTRAS = """
 import sys
 for name in ('torch', 'mitsuba', 'skimage', 'flip_evaluator'):

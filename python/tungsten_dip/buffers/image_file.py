@@ -47,6 +47,9 @@ MOST_HDR = np.nextafter(np.float32(2.0**127), np.float32(0))
 _MOST_BYTES = 16 << 30
 """The most that all parts of a file may hold: zeros take a thousandth of it on disk."""
 
+MOST_CHANNELS = 1000
+"""The most of a part that is to be denoised. OpenImageIO reads 1024 of an output, which has more."""
+
 _RADIANCE_SCALES = {b"EXPOSURE": 1, b"COLORCORR": 3}
 """Lines of a .hdr header that say what the pixels have been multiplied by, and how many numbers each has."""
 
@@ -271,12 +274,20 @@ def checked_name(path: Path) -> str:
     return os.fsencode(path).decode()  # which differs from the text in a locale that is not UTF-8
 
 
+def too_many_channels() -> str:
+    """Return what is said of a part with more than `MOST_CHANNELS`."""
+    return f"expected at most {MOST_CHANNELS} channels in one part, got more; leave out layers"
+
+
 def _decoded(path: Path) -> tuple[Part, ...]:
     config = oiio.ImageSpec()
     config["pnm:pfmflip"] = 1  # rows of a .pfm are stored bottom up
     image = oiio.ImageInput.open(checked_name(path), config)
     if image is None:
-        raise InputError(f"{path}: is no readable image ({_one_line(oiio.geterror())}); render it again")
+        reason = _one_line(oiio.geterror())
+        if "limits:channels" in reason:
+            raise InputError(f"{path}: {too_many_channels()}")
+        raise InputError(f"{path}: is no readable image ({reason}); render it again")
     try:
         parts: list[Part] = []
         size = 0

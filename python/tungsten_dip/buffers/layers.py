@@ -7,6 +7,8 @@
 | Arnold | RGBA (top level) | denoise_albedo, diffuse_albedo, N, Z, and N_noice, Z_noice |
 | pbrt-v4 | top level | Albedo, Ns, N, Variance (of one sample; attribute samplesPerPixel) |
 | Mitsuba 3 | top level | as the user named them: albedo, nn, sh_normal, dd.y, depth |
+| LuxCore | top level | ALBEDO, AVG_SHADING_NORMAL, DEPTH |
+| V-Ray | top level | diffuseFilter, normals |
 | ours | noisy (top level is the denoised picture) | as in the input |
 """
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tungsten_dip.buffers.image_file import is_folder, read_parts
+from tungsten_dip.buffers.image_file import MOST_CHANNELS, is_folder, read_parts, too_many_channels
 from tungsten_dip.buffers.layers import (
     NOTHING,
     PLANES,
@@ -236,6 +236,8 @@ def _find_layers(source: Source) -> tuple[dict[str, tuple[Part, str]], Found]:
 
 
 def _from_source(path: Path, source: Source, attributes: Mapping[str, Any]) -> RenderBuffers:
+    if any(len(part.channels) > MOST_CHANNELS for part in source.parts):
+        raise InputError(f"{path}: {too_many_channels()}")
     try:
         owner, found = _find_layers(source)
     except InputError as error:

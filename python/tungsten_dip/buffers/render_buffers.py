@@ -50,19 +50,45 @@ class Traits:
 
 
 TRAITS: dict[Quantity, Traits] = {
-    "color": Traits("RGB", ("noisy image", "noisy", "color", "", "rgba", "beauty", "combined", "ci")),
+    "color": Traits(
+        "RGB", ("noisy image", "noisy", "color", "", "rgba", "beauty", "combined", "ci", "c", "image")
+    ),
     "albedo": Traits(
         "RGB",
-        ("denoising albedo", "denoise_albedo", "albedo", "diffuse_albedo", "diffcol", "diffuse color"),
+        (
+            "denoising albedo",
+            "denoising_albedo",
+            "denoise_albedo",
+            "albedo",
+            "diffuse_albedo",
+            "diffcol",
+            "diffuse color",
+            "diffusefilter",
+            "vraydiffusefilter",
+        ),
         is_feature=True,
     ),
     "normal": Traits(
         "XYZ",
-        ("denoising normal", "n_noice", "normal", "normals", "sh_normal", "ns", "nn", "n"),
+        (
+            "denoising normal",
+            "denoising_normal",
+            "n_noice",
+            "normal",
+            "normals",
+            "avg_shading_normal",
+            "shading_normal",
+            "sh_normal",
+            "ns",
+            "nn",
+            "n",
+        ),
         is_feature=True,
         signed=True,
     ),
-    "depth": Traits("Y", ("denoising depth", "z_noice", "depth", "dd.y", "dd", "z"), is_feature=True),
+    "depth": Traits(
+        "Y", ("denoising depth", "denoising_depth", "z_noice", "depth", "dd.y", "dd", "z"), is_feature=True
+    ),
     # No feature: one random shadow ray a sample is as noisy as the colour.
     "visibility": Traits("Y", ("visibility",)),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -108,6 +109,9 @@ def files_of_scene(path: Path) -> tuple[dict[str, Path], list[str]]:
         if noise and not any(_is_file(files[key]) for key in noise):
             # A render of 1 spp has no halves. If some of these files are missing, it was cut short.
             ignored.append(f"{quantity}: no {', '.join(files.pop(key).name for key in noise)}")
+    twice = [file for file, times in Counter(files.values()).items() if times > 1]
+    if twice:
+        raise InputError(f"{path}: expected one file for every buffer, got {twice[0].name} twice; rename one")
     missing = [file for file in files.values() if not _is_file(file)]
     if missing:
         raise InputError(f"{path}: saves {missing[0]}, which does not exist; render the scene first")

@@ -218,7 +218,12 @@ def _checked_outputs(scene: Scene, options: Options, taken: set[Path], inputs: s
     Raises InputError if a file cannot be written, or would be written over an input or one that is taken.
     """
     if options.output_directory is not None:
-        options.output_directory.mkdir(parents=True, exist_ok=True)
+        try:
+            options.output_directory.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise InputError(
+                f"{options.output_directory}: expected a folder, found a file; choose another name"
+            ) from error
     outputs = scene_outputs(
         scene,
         options.output_directory,

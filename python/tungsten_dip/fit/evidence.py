@@ -111,6 +111,7 @@ def evidence_from_buffers(
     halves = limited.halves
     surfaces = surfaces_of_colors(buffers, halves, scale, threads)
     stage(progress, "features")(1.0, "features")
+    notes = _notes_on_features(buffers)
     extra_pilots: list[Halves] = []
     if with_oidn:
         a, b = oidn_pilot(buffers, halves, threads)
@@ -119,6 +120,7 @@ def evidence_from_buffers(
     if layout is not None:
         features_there = (*surfaces[0].names, *surfaces[0].left_out)
         layout.check_fits(features_there, len(extra_pilots) + (previous is not None))
+        notes += layout.notes_on_features(features_there)
 
     occupied = occupied_pixels(halves, buffers, threads)
     guides = guides_of_colors(halves, surfaces, threads)
@@ -143,7 +145,7 @@ def evidence_from_buffers(
         guide_variance=guides.variance,
         gain=limited.gain,
         halves_drawn=image.drawn,
-        notes=(*_notes_on_features(buffers), *([limited.note] if limited.note else []), *image.notes),
+        notes=(*notes, *([limited.note] if limited.note else []), *image.notes),
         threads=threads,
     )
     cues = Cues(

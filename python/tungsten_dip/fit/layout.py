@@ -79,6 +79,12 @@ class Layout:
                 f"previous frame), this input comes with {extra_count}; fit without the model"
             )
 
+    def notes_on_features(self, features: Collection[str]) -> tuple[str, ...]:
+        """Return a note on those of an image's features of which the network knows no channel, if any."""
+        known, there = ({name.partition(".")[0] for name in names} for names in (self.features, features))
+        unknown = ", ".join(sorted(there - known))
+        return (f"the model was fitted without {unknown}: its network does not use it",) if unknown else ()
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """The names of what `inputs_of_half` yields, in its order."""

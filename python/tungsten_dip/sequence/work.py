@@ -175,6 +175,8 @@ def failed(frame: Frame, error: BaseException) -> Record:
     message = " ".join(str(error).split())
     if not (message and isinstance(error, (InputError, OSError))):
         message = f"{type(error).__name__}: {message}".removesuffix(": ")
+    if frame.output.is_file():
+        message += f"; {frame.output} is an earlier result"
     return Record(frame.number, str(frame.output), error=message)
 
 

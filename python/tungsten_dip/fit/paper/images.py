@@ -75,7 +75,7 @@ def paper_images(buffers: RenderBuffers, settings: FitSettings) -> PaperImages:
         quantities = (_QUANTITY_FROM_INPUTS[settings.inputs],)
         if buffers.get(quantities[0]) is None:
             raise InputError(
-                f"inputs {settings.inputs}: expected a {quantities[0]} buffer, found none; "
+                f"inputs {settings.inputs}: expected the buffer {quantities[0]}, found none; "
                 f"render it, or use inputs all (what is there) or random"
             )
     for quantity in quantities:

@@ -26,15 +26,15 @@ _LOG = logging.getLogger(__name__)
 _GAP_RADII = (2, 1)
 """Radii of the windows whose samples fill a gap; the smaller one, where it has any, tells surfaces apart."""
 
-_LARGEST_ALBEDO = 2.0
-"""Albedo of a surface: 1, and what noise and the lobes of a pixel filter add. Percent and 8 bits are far
-above."""
+_LARGEST_ALBEDO = 1.1
+"""Albedo of a surface: 1, and what the lobes of a pixel filter add. Percent and 8 bits are far above."""
 
 _SEEN_LIGHT = np.float32(1 / 3)
 """Part of a lamp's radiance that the colour contains at least; fog or a lens that darkens takes the rest."""
 
-_UNSEEN_SHARE = 0.5
-"""Part of an albedo that may be above that without such light. In renders, mirrors make it 0.03 at most."""
+_UNSEEN_SHARE = 0.1
+"""Part of an albedo that may be above that without such light. In renders, mirrors make it 0.03 at most, and
+of an albedo twice as large it is above 0.1 on most images."""
 
 
 @dataclass(frozen=True)
@@ -148,16 +148,16 @@ def _finite(image: FloatImage) -> npt.NDArray[np.bool_]:
 
 
 def _without_albedo_of_another_scale(buffers: RenderBuffers) -> RenderBuffers:
-    """Return buffers without an albedo that is mostly above 2 where the colour shows no such light.
+    """Return buffers without an albedo that is above 1 in many pixels whose colour shows no such light.
 
     Above 1 it would be taken for emission. Of a lamp or an environment it is the radiance, which the colour
     contains; of surfaces in percent, or in 8 bits, it is not.
     """
     color = buffers.color.mean
-    if buffers.albedo is None or not color.any():  # a black colour shows nothing of the albedo
+    if buffers.albedo is None or not color.any():  # black shows nothing of the albedo
         return buffers
     albedo = buffers.albedo.mean
-    unseen = (albedo > _LARGEST_ALBEDO) & (color < _SEEN_LIGHT * albedo)
+    unseen = (albedo > _LARGEST_ALBEDO) & (color > 0) & (color < _SEEN_LIGHT * albedo)
     if np.count_nonzero(unseen) <= _UNSEEN_SHARE * np.count_nonzero(albedo):
         return buffers
     _LOG.warning(
