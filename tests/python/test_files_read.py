@@ -838,7 +838,7 @@ def test_sizes_must_agree(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"got 7 x 5 pixels from \(2, 0\); bring all to one data window"):
         read_buffers(tmp_path)
     save_parts(tmp_path / "p.exr", rgba={n: pixels(0) for n in "RGB"}, depth={"Z": pixels(0, width=9)})
-    refused(tmp_path / "p.exr", "expected 7 x 5")
+    refused(tmp_path / "p.exr", "expected 7 x 5 .*, got 9 x 5 .*; render all at .*, or use --map depth=none")
 
 
 def test_where_the_map_chooses_no_layers_the_advice_is_another(tmp_path: Path) -> None:

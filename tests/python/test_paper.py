@@ -112,7 +112,9 @@ def test_constant_channels_do_not_reach_the_network():
     ("inputs", "quantity"), [("normals", "normal"), ("depths", "depth"), ("albedos", "albedo")]
 )
 def test_a_missing_feature_is_named(inputs, quantity):
-    with pytest.raises(InputError, match=rf"inputs {inputs}: expected a {quantity} buffer.*use inputs all"):
+    with pytest.raises(
+        InputError, match=rf"inputs {inputs}: expected the buffer {quantity}, .*use inputs all"
+    ):
         paper_images(noise_buffers(**{quantity: None}), settings(inputs=inputs))
 
 

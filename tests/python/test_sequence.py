@@ -25,7 +25,7 @@ from tungsten_dip.scene.types import EquirectangularCamera, PinholeCamera, Thinl
 from tungsten_dip.sequence.flicker import estimated_flicker, flicker
 from tungsten_dip.sequence.following import Follower, Models, _typical_error
 from tungsten_dip.sequence.frames import RECORD, find_frames, numbers_from_text, text_from_numbers
-from tungsten_dip.sequence.reprojection import check_camera, reproject
+from tungsten_dip.sequence.reprojection import _neighbours, check_camera, reproject
 from tungsten_dip.sequence.work import Run
 
 DRAFT = FitSettings(preset="draft", threads=1)
@@ -794,3 +794,10 @@ def test_what_cannot_be_done_is_told_before_the_first_frame(tmp_path, monkeypatc
     without = frame.buffers.with_quantities(normal=None)
     with pytest.raises(InputError, match="the model was fitted with normal"):
         Follower(DRAFT, models=Models(alone=model)).denoise(without)
+
+
+def test_every_pixel_of_a_large_image_is_found():
+    """7680 x 4320 pixels are more than a float32 counts."""
+    column, row = np.float32([7001]), np.float32([4300])
+    [index] = [index[0] for index, weight in _neighbours(column, row, 4320, 7680) if weight[0] == 1]
+    assert index == 4300 * 7680 + 7001

@@ -319,7 +319,8 @@ def _plane(
     channels = []
     for part, name in sources:
         if part.window != main.window:
-            raise InputError(_sizes_differ(f"{path}: {key}", part, main))
+            differ = _sizes_differ(f"{path}: {key}", part, main)
+            raise InputError(differ if key == "color" else f"{differ}, or use --map {key}={NOTHING}")
         channels.append(part.channels[name])
     stacked = np.stack([channel.astype(np.float32) for channel in channels], axis=-1)
     plane = _with_channel_count(stacked, path, key, names)

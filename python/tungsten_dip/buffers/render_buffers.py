@@ -208,7 +208,7 @@ class RenderBuffers:
         return buffer
 
     def quantities(self) -> Iterator[tuple[Quantity, Buffer]]:
-        """Yield (name, buffer) for colour and every feature that is known."""
+        """Yield (name, buffer) for every quantity that is known."""
         for quantity in CHANNELS:
             buffer = self.get(quantity)
             if buffer is not None:

@@ -91,12 +91,14 @@ def write_layers(
     write_exr(path, parts, threads)
 
 
-def write_error_map(path: Path, error: FloatImage, buffers: RenderBuffers) -> None:
+def write_error_map(path: Path, error: FloatImage, buffers: RenderBuffers, threads: int | None) -> None:
     """Write the error of a result, shape (height, width, 1), as float32, with the buffers' data window.
+
+    ``threads`` None uses every core.
 
     Raises InputError if the file cannot be written.
     """
-    write_exr(path, [Part(_channels("", "Y", error), _frame(buffers))])
+    write_exr(path, [Part(_channels("", "Y", error), _frame(buffers))], threads)
 
 
 def write_tungsten_folder(folder: str | Path, buffers: RenderBuffers) -> None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from tungsten_dip.cli.outcome import Outcome
 from tungsten_dip.errors import InputError
-from tungsten_dip.extras import EXTRA_BY_MODULE, requirement
+from tungsten_dip.failures import line_of_failure
 from tungsten_dip.remarks import logging_to
 
 tqdm.get_lock()  # made on first use otherwise, which Ctrl-C must not cut short
@@ -27,19 +27,6 @@ EXIT_INTERNAL, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 DEBUG_VARIABLE = "TUNGSTEN_DIP_DEBUG"
 """Set in the environment, it lets tracebacks through."""
-
-_NO_MEMORY = (
-    "t allocate memory",
-    "Cannot allocate memory",
-    "Failed to allocate memory",
-    "bad_alloc",
-    "failed to map segment",
-    "error return without exception set",
-    # A thread needs memory for its stack.
-    "can't start new thread",
-    "Resource temporarily unavailable",
-)
-"""What torch, onnxruntime, the loader of libraries and CPython say in place of raising MemoryError."""
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
@@ -93,19 +80,10 @@ def run(command: str, body: Callable[[], None]) -> int:
 
 def line_and_status(error: Exception) -> tuple[str, int]:
     """Return what is told of an error, in one line, and the exit status of a command that it ends."""
-    if isinstance(error, OSError) and error.filename is not None:
-        line, status = f"{error.filename}: {error.strerror}; check the path and its permissions", EXIT_INPUT
-    elif isinstance(error, (InputError, OSError)):
-        line, status = str(error), EXIT_INPUT
-    elif isinstance(error, ModuleNotFoundError) and error.name in EXTRA_BY_MODULE:
-        line, status = requirement(error.name, "this"), EXIT_INPUT
-    elif isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _NO_MEMORY):
-        reason = str(error)[:200] or "none left"
-        line, status = f"not enough memory ({reason}); free some, or use a smaller image", EXIT_INPUT
-    else:
-        line = f"internal error: {type(error).__name__}: {error}; set {DEBUG_VARIABLE}=1 to see where"
-        status = EXIT_INTERNAL
-    return " ".join(line.split()), status
+    line, mendable = line_of_failure(error)
+    if mendable:
+        return line, EXIT_INPUT
+    return f"internal error: {line}; set {DEBUG_VARIABLE}=1 to see where", EXIT_INTERNAL
 
 
 @contextmanager

@@ -209,7 +209,7 @@ def _denoised(
         write_text(options.report, report_page(name, buffers, result, remarks))
     if options.error_map is not None:
         assert result.error is not None
-        write_error_map(options.error_map, result.error, buffers)
+        write_error_map(options.error_map, result.error, buffers, result.settings.threads)
     if options.save_model is not None:
         write_model(options.save_model, result)
 

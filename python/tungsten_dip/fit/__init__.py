@@ -56,11 +56,12 @@ def denoise(
 
     With ``warm_start`` (of an earlier frame, for example) the network starts from the model's weights, with
     its pilots and constants, and trains until the error estimated from the halves falls no further, for at
-    most ``settings.iterations`` steps. Without settings, those that determine the model's network hold
-    (`Model.settings`), but for the iterations.
+    most ``settings.iterations`` steps (all of them with ``paper``). Without settings, those that determine
+    the model's network hold (`Model.settings`), but for the iterations.
 
-    Raises InputError if the image is empty, what the settings require is missing (a buffer, a device, torch
-    for the preset paper), or the model does not fit the image or the settings.
+    Raises InputError if an argument is of another type, the image is empty, what the settings require is
+    missing (a buffer, a device, torch for the preset paper), or the model does not fit the image or the
+    settings.
     """
     if warm_start is not None:
         check_type("warm_start", warm_start, Model, "load_model reads one from a file")

@@ -173,7 +173,7 @@ def result_from_image(
     halves_drawn: bool = False,
     model: Model | None = None,
 ) -> FitResult:
-    """Return the result of a network without training."""
+    """Return the result that consists of these images; it tells of no training."""
     return FitResult(
         color=image.color,
         settings=settings,

@@ -1,4 +1,4 @@
-"""Refuses a render that would run out of memory, before it starts."""
+"""How large a picture fits into memory; refuses a render that does not, before it starts."""
 
 from __future__ import annotations
 

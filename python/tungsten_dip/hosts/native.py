@@ -79,7 +79,9 @@ def render_in_child(scene: Path, options: dict[str, Any], progress: Progress) ->
         if status:
             error = Path(folder, "error")
             raise InputError(
-                error.read_text() if error.exists() else f"{scene}: Tungsten ended with status {status}"
+                os.fsdecode(error.read_bytes())
+                if error.exists()
+                else f"{scene}: Tungsten ended with status {status}; what it printed tells why"
             )
         with np.load(Path(folder, "buffers.npz")) as arrays:
             buffers: dict[str, Any] = {
@@ -109,7 +111,7 @@ def render_to_folder(arguments: Sequence[str]) -> int:
         try:
             buffers = render(scene, **json.loads(options), progress=progress)
         except InputError as error:
-            Path(folder, "error").write_text(str(error))
+            Path(folder, "error").write_bytes(os.fsencode(str(error)))
             return 2
     arrays: dict[str, Any] = {
         f"{name}.{plane}": array for name, buffer in buffers.quantities() for plane, array in buffer.planes()

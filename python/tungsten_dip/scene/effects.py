@@ -1,7 +1,4 @@
-"""Which effects a scene uses, and which buffers are informative for it.
-
-The hosts simulate nothing else: docs/scenes.md describes how.
-"""
+"""Which effects a scene uses, and which buffers are informative for it (docs/scenes.md)."""
 
 from __future__ import annotations
 

@@ -158,8 +158,9 @@ def _neighbours(
         for across in (0, 1):
             x = left + across
             of_column = np.where((x >= 0) & (x < width), right_share if across else 1 - right_share, 0)
-            index = np.clip(y, 0, height - 1) * width + np.clip(x, 0, width - 1)
-            yield index.astype(np.intp), (of_row * of_column).astype(np.float32)
+            # A float32 does not tell all pixels of a large image apart.
+            in_row, in_column = (np.clip(of, 0, n - 1).astype(np.intp) for of, n in ((y, height), (x, width)))
+            yield in_row * width + in_column, (of_row * of_column).astype(np.float32)
 
 
 def _same_surface(

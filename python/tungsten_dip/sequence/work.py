@@ -18,6 +18,7 @@ from typing import Any, Literal
 from tungsten_dip.buffers.image_file import is_whole, read_attributes
 from tungsten_dip.buffers.read import input_files, read_buffers
 from tungsten_dip.errors import InputError, whole_number
+from tungsten_dip.failures import line_of_failure
 from tungsten_dip.fit.settings import MOST_ITERATIONS, FitSettings
 from tungsten_dip.fit.write import write_denoised
 from tungsten_dip.progress import Progress, part_of, silent
@@ -167,14 +168,9 @@ def _denoise(frame: Frame, run: Run, follower: Follower, is_consecutive: bool, p
 
 
 def failed(frame: Frame, error: BaseException) -> Record:
-    """Return the record of a frame that has no result; the traceback is logged for whoever looks for it.
-
-    Errors of input say in words what to do; of any other the type belongs to what happened.
-    """
+    """Return the record of a frame that has no result; the traceback is logged for whoever looks for it."""
     _LOG.debug("frame %d failed", frame.number, exc_info=error)
-    message = " ".join(str(error).split())
-    if not (message and isinstance(error, (InputError, OSError))):
-        message = f"{type(error).__name__}: {message}".removesuffix(": ")
+    message, _ = line_of_failure(error)
     if frame.output.is_file():
         message += f"; {frame.output} is an earlier result"
     return Record(frame.number, str(frame.output), error=message)

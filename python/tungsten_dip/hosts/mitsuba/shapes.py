@@ -88,7 +88,7 @@ def emission_node(builder: SceneBuilder, primitive: ts.Primitive, area: float, u
     }
 
 
-def _surroundings(builder: SceneBuilder, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
+def _bsdf_and_media(builder: SceneBuilder, primitive: ts.Primitive, bsdf: ts.Bsdf, uv: Matrix = UV) -> Node:
     """What a shape needs beside its geometry and its light: its BSDF and media."""
     surface = bsdf_object(builder, bsdf, uv, shape=_BENT_SHAPES.get(type(primitive)))
     node: Node = {surface.id(): surface}  # Mitsuba renames what it finds under another name
@@ -126,7 +126,7 @@ def _mesh(builder: SceneBuilder, primitive: ts.Mesh) -> list[Any]:
         if not part.any():
             continue
         triangles = mesh.triangles[part]
-        node = {**_surroundings(builder, primitive, bsdf), **emission}
+        node = {**_bsdf_and_media(builder, primitive, bsdf), **emission}
         if emission and normals is not None:
             faces = _triangles({}, positions, triangles, mesh.uvs)
             node["emitter"] = {**emission["emitter"], "faces": faces}
@@ -142,7 +142,7 @@ def _quad(builder: SceneBuilder, primitive: ts.Quad) -> Any:
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions = centre + (uv[:, :1] - 0.5) * edge_x + (uv[:, 1:] - 0.5) * edge_z
     triangles = np.array([[0, 2, 1], [0, 3, 2]])
-    node = _surroundings(builder, primitive, primitive.bsdf)
+    node = _bsdf_and_media(builder, primitive, primitive.bsdf)
     node |= emission_node(builder, primitive, float(lengths[0] * lengths[1]))
     return _triangles(node, positions, triangles, uv)
 
@@ -168,7 +168,7 @@ def _cube(builder: SceneBuilder, primitive: ts.Cube) -> Any:
     if np.linalg.det(rotation) < 0.0:
         indices = indices[:, ::-1]
     area = 2.0 * float(scale[0] * scale[1] + scale[1] * scale[2] + scale[2] * scale[0])
-    node = _surroundings(builder, primitive, primitive.bsdf) | emission_node(builder, primitive, area)
+    node = _bsdf_and_media(builder, primitive, primitive.bsdf) | emission_node(builder, primitive, area)
     points = centre + (np.concatenate(positions) * scale) @ rotation.T
     return _triangles(node, points, indices, np.concatenate(uv))
 
@@ -183,7 +183,7 @@ def _sphere(builder: SceneBuilder, primitive: ts.Sphere) -> Node:
         "to_world": transform(_affine(axes, centre)),
         # Mirrored, Mitsuba's sphere would be one that is seen from within.
         "flip_normals": bool(np.linalg.det(rotation) < 0.0),
-        **_surroundings(builder, primitive, primitive.bsdf),
+        **_bsdf_and_media(builder, primitive, primitive.bsdf),
         **emission_node(builder, primitive, 4.0 * math.pi * radius**2),
     }
 
@@ -199,7 +199,7 @@ def _disk(builder: SceneBuilder, primitive: ts.Disk) -> Node:
     return {
         "type": "disk",
         "to_world": transform(_affine(axes, centre)),
-        **_surroundings(builder, primitive, primitive.bsdf, _DISK_UV),
+        **_bsdf_and_media(builder, primitive, primitive.bsdf, _DISK_UV),
         **emission,
     }
 
@@ -218,7 +218,7 @@ def _cylinder(builder: SceneBuilder, primitive: ts.Cylinder) -> list[Node]:
         {
             "type": "cylinder",
             "to_world": transform(side),
-            **_surroundings(builder, primitive, primitive.bsdf, _CYLINDER_UV),
+            **_bsdf_and_media(builder, primitive, primitive.bsdf, _CYLINDER_UV),
             **emission,
         }
     ]
@@ -231,7 +231,7 @@ def _cylinder(builder: SceneBuilder, primitive: ts.Cylinder) -> list[Node]:
                 {
                     "type": "disk",
                     "to_world": transform(_affine(axes, centre + 0.5 * sign * height * y)),
-                    **_surroundings(builder, primitive, primitive.bsdf),
+                    **_bsdf_and_media(builder, primitive, primitive.bsdf),
                     **emission,
                 }
             )
