@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from tungsten_dip.errors import InputError
 
 EXTRA_BY_MODULE = {
-    "torch": "fit",
+    "torch": "paper",
     "mitsuba": "mitsuba",
     "drjit": "mitsuba",
     "flip_evaluator": "compare",

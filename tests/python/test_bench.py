@@ -349,7 +349,7 @@ def test_peers_that_are_missing_are_left_out_and_that_is_said(bench_set, fits, t
         (found,) = run_pareto([bench_set], plan, tmp_path)
     assert [row.label for row in found.rows] == ["noisy", *QUICK.presets]
     assert "measured without more samples" in caplog.text
-    assert "pip install 'tungsten-dip[fit]'" in caplog.text
+    assert "pip install 'tungsten-dip[paper]'" in caplog.text
     assert "pip install 'tungsten-dip[oidn]'" in caplog.text
     assert "NFOR is left out" in caplog.text
 

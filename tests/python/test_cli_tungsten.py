@@ -475,7 +475,7 @@ def test_torch_is_missed_before_the_render(tmp_path, scene, monkeypatch, capfd):
         == 2
     )
     captured = capfd.readouterr()
-    assert "pip install 'tungsten-dip[fit]'" in captured.err
+    assert "pip install 'tungsten-dip[paper]'" in captured.err
     assert "Traceback" not in captured.err
     assert not (tmp_path / "out").exists()
 
