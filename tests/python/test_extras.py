@@ -32,7 +32,7 @@ def test_all_files_name_the_release_of_mitsuba_that_is_asked_for(file: str, coun
 
 def test_a_missing_module_is_named_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tungsten_dip.extras.find_spec", lambda name: None)
-    message = r"preset paper needs torch; install it with: pip install 'tungsten-dip\[fit\]'"
+    message = r"preset paper needs torch; install it with: pip install 'tungsten-dip\[paper\]'"
     with pytest.raises(InputError, match=message):
         require("torch", "preset paper")
 
